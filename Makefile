@@ -1,0 +1,80 @@
+# DAR: build, test, measure.  `make help` lists the targets.
+#
+#   MODE=release|debug|asan    one folder each: build/$(MODE); nothing is written elsewhere
+#   CC=gcc|clang               both build without a warning
+#
+# Binaries are portable: files named *_avx2.c, *_avx512.c are compiled for those instructions and called only
+# where the processor has them.
+
+MODE ?= release
+B    := build/$(MODE)
+
+CSTD   := -std=c11 -D_GNU_SOURCE -I. -isystem /usr/include/cjson
+WARN   := -Wall -Wextra -Wpedantic -Wshadow -Wvla -Wstrict-prototypes -Wmissing-prototypes -Werror
+NUM    := -ffp-contract=off -fno-math-errno -fno-trapping-math
+OMP    := -fopenmp
+OPT_release := -O3 -g
+OPT_debug   := -O0 -g3
+OPT_asan    := -O1 -g -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer
+CFLAGS += $(CSTD) $(WARN) $(NUM) $(OMP) $(OPT_$(MODE))
+
+# The openmp flavour of OpenBLAS shares our thread pool; the default alternative (pthread) fights it.
+BLAS_DIR := $(firstword $(wildcard /usr/lib/*/openblas-openmp) /usr/lib)
+LDFLAGS  += $(OMP) $(filter -fsanitize=%,$(OPT_$(MODE))) -L$(BLAS_DIR) -Wl,-rpath,$(BLAS_DIR)
+LIBS     := -lopenblas -lcjson -lm
+
+# Instruction sets per file, read by the one compile rule.
+AVX2   := -mavx2 -mfma -mf16c
+AVX512 := $(AVX2) -mavx512f -mavx512bw -mavx512vl -mavx512dq -mprefer-vector-width=512
+isa     = $(if $(filter %_avx2,$1),$(AVX2))$(if $(filter %_avx512,$1),$(AVX512))$(if $(filter %_bf16,$1),$(AVX512) -mavx512bf16)$(if $(filter %_vnni,$1),$(AVX512) -mavx512vnni)
+
+ROOMS := lib autograd autograd/ops models data
+SRC   := $(wildcard $(addsuffix /*.c,$(ROOMS)))
+OBJ   := $(SRC:%.c=$B/%.o)
+TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
+FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
+
+.PHONY: all test test-built check stress bench-kernels ulp fuzz deps clean help FORCE
+.DELETE_ON_ERROR:
+.SECONDARY:
+all: $B/libdar.a ## build the library and the programs
+
+help: ## this list
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-14s %s\n", $$1, $$2}' Makefile
+	@echo "  MODE=release|debug|asan, CC=gcc|clang"
+
+deps: ## install the Debian packages that are missing
+	@scripts/install-deps.sh
+
+# ---------------------------------------------------------------- compile
+$B/%.o: %.c $B/flags
+	@mkdir -p $(@D)
+	@echo "CC $<"
+	@$(CC) $(CFLAGS) $(call isa,$*) -MMD -MP -c -o $@ $<
+
+$B/flags: FORCE
+	@mkdir -p $(@D)
+	@echo '$(CC) $(CFLAGS) $(LDFLAGS)' | cmp -s - $@ || echo '$(CC) $(CFLAGS) $(LDFLAGS)' > $@
+
+$B/libdar.a: $(OBJ)
+	@rm -f $@
+	@ar rcs $@ $^
+
+-include $(wildcard $B/*/*.d $B/*/*/*.d)
+
+# ---------------------------------------------------------------- test
+$B/test_%: $B/tests/test_%.o $B/libdar.a
+	@echo "LD $@"
+	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS) -lcmocka
+
+test: deps ## install what is missing, build, run every test; the last line counts them
+	@$(MAKE) --no-print-directory test-built
+
+test-built: $(TESTS:%=$B/%)
+	@scripts/run-tests.sh $B $(TESTS)
+
+check: ## layers, style, headers alone, clang-format; then gcc, clang and sanitizer builds with their tests
+	@scripts/check.sh
+
+clean: ## remove build/
+	rm -rf build

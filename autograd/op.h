@@ -1,0 +1,99 @@
+/* op.h: what an op is.
+ *
+ * An op is one descriptor in one file: shape rule, forward, backward, and the samples its tests are made of.  It is
+ * listed once, in ops.def.  The tape (autograd/tape.h) calls it; nothing else does.
+ *
+ * Contract
+ *   forward    overwrites y, and aux if it is there (aux.data is NULL when nobody will call backward).
+ *   backward   for each i with gx[i].data: gx[i] = (add[i] ? gx[i] : 0) + J_i^T gy.  Reads only x[i], y named in
+ * `keep`, aux and gy. neither    allocates, or keeps state; scratch comes with the context, of the size that `scratch`
+ * asked for. Every tensor is contiguous.  Storage types may differ from input to input; arithmetic is f64 if y or x[0]
+ * is f64, else f32 or wider.  Gradients and aux are of the arithmetic type.  Results have the same bits for any number
+ * of threads. */
+#ifndef DAR_AUTOGRAD_OP_H
+#define DAR_AUTOGRAD_OP_H
+
+#include <stdbool.h>
+#include <stddef.h>
+
+#include "lib/tensor.h"
+
+#define DAR_OP_IN 8 /* most inputs */
+
+typedef struct dar_opctx {
+    const void *attr;
+    dar_tensor x[DAR_OP_IN]; /* data NULL: optional input that is absent */
+    dar_tensor y;
+    dar_tensor aux; /* what forward saves for backward, as asked for by the descriptor */
+    dar_tensor gy;
+    dar_tensor gx[DAR_OP_IN]; /* data NULL: not wanted (frozen) */
+    bool add[DAR_OP_IN];
+    void *scratch;
+    int threads; /* scratch that is per thread is for this many */
+} dar_opctx;
+
+/* One set of inputs for the table test.  Values are uniform in [lo, hi] (both 0: [-1, 1]) unless `fill` sets them. */
+typedef struct dar_sample {
+    dar_shape in[DAR_OP_IN]; /* n = -1: absent */
+    const void *attr;        /* NULL if the op has none */
+    double lo, hi;
+    double gap;                                   /* keep |x| >= gap: distance from a kink at 0 */
+    void (*fill)(int input, const dar_tensor *x); /* f64; called after the uniform fill; NULL if not needed */
+} dar_sample;
+
+/* Shapes that must abort. */
+typedef struct dar_error_sample {
+    dar_shape in[DAR_OP_IN];
+    const void *attr;
+} dar_error_sample;
+
+#define DAR_KEEP_X(i) (1u << (i))
+#define DAR_KEEP_Y    (1u << 31)
+
+typedef struct dar_op {
+    const char *name;
+    int n_in; /* inputs, the optional ones last; a variadic op (concat) takes 1..n_in, all present */
+    int n_optional;
+    bool variadic;
+    bool strided;     /* forward takes strided views as they are */
+    unsigned keep;    /* what backward reads */
+    unsigned frozen;  /* DAR_KEEP_X bits of inputs that never get a gradient (positions, masks) */
+    size_t attr_size; /* bytes copied onto the tape */
+
+    /* Shape of y; aborts if the inputs do not fit.  in[i].n = -1 for an absent one. */
+    dar_shape (*shape)(const dar_shape *in, int n_in, const void *attr);
+    /* Storage type of y; NULL: that of x[0]. */
+    dar_dtype (*dtype)(const dar_dtype *in, int n_in, const void *attr);
+    /* Shape of aux, in the arithmetic type; NULL: none. */
+    dar_shape (*aux)(const dar_shape *in, int n_in, const void *attr);
+    /* Bytes of scratch; NULL: none.  Tensors in c have shapes and types but may have no memory. */
+    size_t (*scratch)(const dar_opctx *c, bool backward);
+    /* Floating-point operations of one call, for the gradients that are wanted; NULL: not counted. */
+    double (*flops)(const dar_opctx *c, bool backward);
+
+    /* A view: y is this view of x[0] and forward, backward are NULL; the tape does both. */
+    dar_tensor (*view)(const dar_tensor *x, const void *attr);
+
+    void (*forward)(const dar_opctx *c);
+    void (*backward)(const dar_opctx *c); /* NULL with no_backward saying why */
+    const char *no_backward;
+
+    const dar_sample *samples;
+    int n_samples;
+    const dar_error_sample *errors;
+    int n_errors;
+} dar_op;
+
+/* dar_op_silu, ... : every op of ops.def. */
+#define DAR_OP(name) extern const dar_op dar_op_##name;
+#include "autograd/ops.def"
+#undef DAR_OP
+
+/* All of them, in the order of ops.def. */
+extern const dar_op *const dar_ops[];
+extern const int dar_n_ops;
+
+/* Arithmetic type of a call: f64 if y or x[0] is f64, else f32. */
+dar_dtype dar_op_compute(const dar_opctx *c);
+
+#endif

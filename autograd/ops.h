@@ -1,0 +1,33 @@
+/* ops.h: every op, as the networks call it.
+ *
+ * x has any storage type unless said; y has x's storage type unless said.  Gradients are f32, or f64 where x is f64.
+ * Letters as in the whole project: B batch, T frames, H W height and width, C channels, N tokens, D width of the model,
+ * A heads, E head size, F feed-forward width.  Shapes that do not fit abort with the op's name. */
+#ifndef DAR_AUTOGRAD_OPS_H
+#define DAR_AUTOGRAD_OPS_H
+
+#include "autograd/tape.h"
+
+/* ---------------------------------------------------------------- arithmetic */
+
+/* ---------------------------------------------------------------- activations */
+
+/* y = x sigmoid(x), elementwise.  Source: Elfwing et al. 2018, eq. 4. */
+dar_val *dar_silu(dar_tape *t, dar_val *x);
+
+/* ---------------------------------------------------------------- norms and what surrounds them */
+
+/* ---------------------------------------------------------------- products */
+
+/* ---------------------------------------------------------------- attention */
+
+/* ---------------------------------------------------------------- convolution and resampling */
+
+/* ---------------------------------------------------------------- shape */
+
+/* The same values in contiguous memory: always a copy. */
+dar_val *dar_contiguous(dar_tape *t, dar_val *x);
+
+/* ---------------------------------------------------------------- reductions */
+
+#endif

@@ -1,0 +1,411 @@
+/* tape.c: calls, nodes, the backward sweep, segments. */
+#include "autograd/tape.h"
+
+#include <string.h>
+
+#include "autograd/ops.h"
+#include "lib/kern.h"
+#include "lib/thread.h"
+
+#define META_BYTES ((size_t)256 << 20) /* address space; pages are taken as they are used */
+#define MAX_KEPT   4                   /* results one segment can keep */
+
+struct dar_spare {
+    struct dar_spare *next;
+    size_t bytes;
+    void *data;
+};
+
+struct kept {
+    dar_tensor y, aux;
+};
+
+struct dar_keeping {
+    int n, at; /* kept so far; next to be replayed */
+    struct kept of[MAX_KEPT];
+};
+
+struct dar_node {
+    dar_node *prev;
+    dar_val *in[DAR_OP_IN];
+    int n;
+    dar_val *y;
+    const dar_op *op; /* NULL: a segment */
+    const void *attr;
+    dar_tensor aux;
+    dar_segment_fn *fn;
+    void *arg;
+    struct dar_keeping *kept;
+};
+
+/* ---------------------------------------------------------------- life */
+
+dar_status dar_tape_init(dar_tape *t, dar_arena *arena, dar_err *e)
+{
+    memset(t, 0, sizeof *t);
+    t->arena = arena;
+    t->recording = true;
+    return dar_arena_init(&t->meta, "tape", META_BYTES, e);
+}
+
+void dar_tape_free(dar_tape *t)
+{
+    dar_arena_free(&t->meta);
+    memset(t, 0, sizeof *t);
+}
+
+void dar_tape_clear(dar_tape *t)
+{
+    dar_arena_reset(&t->meta, 0);
+    t->last = NULL;
+    t->spare = NULL;
+    t->bad_op = NULL;
+    t->bad_backward = false;
+    t->cost = (dar_cost){ 0 };
+}
+
+static void *push_meta(dar_tape *t, size_t bytes)
+{
+    return memset(dar_arena_push(&t->meta, bytes), 0, bytes);
+}
+
+static dar_val *push_val(dar_tape *t, dar_tensor x)
+{
+    dar_val *v = push_meta(t, sizeof *v);
+    v->x = x;
+    return v;
+}
+
+dar_val *dar_leaf(dar_tape *t, dar_tensor x, const dar_tensor *g)
+{
+    dar_val *v = push_val(t, x);
+    v->leaf = true;
+    if (g) {
+        DAR_ASSERT(dar_shape_equal(&g->shape, &x.shape) && dar_tensor_contiguous(g) &&
+                       g->dtype == dar_compute_type(x.dtype),
+                   "leaf: the gradient is not a contiguous %s of the value's shape",
+                   dar_dtype_name(dar_compute_type(x.dtype)));
+        v->g = *g;
+        v->wants_grad = v->has_grad = true;
+    }
+    return v;
+}
+
+dar_val *dar_input(dar_tape *t, dar_dtype type, dar_shape s)
+{
+    dar_val *v = push_val(t, dar_tensor_push(t->arena, type, s));
+    v->leaf = true;
+    return v;
+}
+
+/* ---------------------------------------------------------------- a call */
+
+static void look(dar_tape *t, const char *name, const dar_tensor *x, bool backward)
+{
+    if (!t->check_finite || t->bad_op || t->arena->plan) return;
+    int64_t at = dar_tensor_nonfinite(x);
+    if (at >= 0) {
+        t->bad_op = name;
+        t->bad_backward = backward;
+        t->bad_index = at;
+    }
+}
+
+static void run(dar_tape *t, const dar_op *op, dar_opctx *c, bool backward)
+{
+    dar_mark m = dar_arena_mark(t->arena);
+    c->threads = dar_threads();
+    if (op->scratch) c->scratch = dar_arena_push(t->arena, op->scratch(c, backward));
+    if (op->flops) *(backward ? &t->cost.backward : &t->cost.forward) += op->flops(c, backward);
+    t->cost.ops++;
+    if (!t->arena->plan) (backward ? op->backward : op->forward)(c);
+    dar_arena_reset(t->arena, m);
+}
+
+static void check_inputs(const dar_op *op, dar_val *const *in, int n)
+{
+    int least = op->variadic ? 1 : op->n_in - op->n_optional;
+    DAR_ASSERT(n >= least && n <= op->n_in, "%s: %d inputs, expected %d to %d", op->name, n, least, op->n_in);
+    for (int i = 0; i < least; i++) DAR_ASSERT(in[i], "%s: input %d is NULL", op->name, i);
+}
+
+static bool grad_goes_to(const dar_op *op, const dar_val *v, int i)
+{
+    return v && v->wants_grad && !(op->frozen & DAR_KEEP_X(i));
+}
+
+static void fill_inputs(dar_opctx *c, dar_val *const *in, int n)
+{
+    for (int i = 0; i < DAR_OP_IN; i++) {
+        if (i < n && in[i]) c->x[i] = in[i]->x;
+        else c->x[i].shape.n = -1;
+    }
+}
+
+/* The call itself.  ready: y and aux are known from before.  made: give y and aux even though nothing is recorded. */
+static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n, const void *attr,
+                     const struct kept *ready, struct kept *made)
+{
+    dar_val *in[DAR_OP_IN] = { 0 };
+    dar_opctx c = { .attr = attr };
+    dar_shape shape[DAR_OP_IN];
+    dar_dtype type[DAR_OP_IN];
+    bool wants = false;
+
+    check_inputs(op, given, n);
+    for (int i = 0; i < n; i++) {
+        in[i] = given[i];
+        if (in[i] && !op->view && !op->strided && !dar_tensor_contiguous(&in[i]->x)) in[i] = dar_contiguous(t, in[i]);
+        wants |= grad_goes_to(op, in[i], i);
+    }
+    t->touched |= wants;
+    wants &= t->recording;
+    fill_inputs(&c, in, n);
+    for (int i = 0; i < DAR_OP_IN; i++) {
+        shape[i] = c.x[i].shape;
+        type[i] = c.x[i].dtype;
+    }
+    dar_shape s = op->shape(shape, n, attr);
+    DAR_ASSERT(!wants || op->backward || op->view, "%s: no gradient: %s", op->name, op->no_backward);
+
+    if (ready) c.y = ready->y;
+    else if (op->view) c.y = op->view(&c.x[0], attr);
+    else c.y = dar_tensor_push(t->arena, op->dtype ? op->dtype(type, n, attr) : type[0], s);
+    if (ready) c.aux = ready->aux;
+    else if (op->aux && (wants || made)) c.aux = dar_tensor_push(t->arena, dar_op_compute(&c), op->aux(shape, n, attr));
+    if (!ready && !op->view) {
+        run(t, op, &c, false);
+        look(t, op->name, &c.y, false);
+    }
+    dar_val *y = push_val(t, c.y);
+    y->wants_grad = wants;
+    if (wants) {
+        dar_node *node = push_meta(t, sizeof *node);
+        void *copy = op->attr_size ? dar_arena_push(&t->meta, op->attr_size) : NULL;
+        if (copy) memcpy(copy, attr, op->attr_size);
+        *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = copy, .aux = c.aux };
+        memcpy(node->in, in, sizeof in);
+        t->last = node;
+    }
+    if (made) *made = (struct kept){ c.y, c.aux };
+    return y;
+}
+
+dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr)
+{
+    return call(t, op, in, n, attr, NULL, NULL);
+}
+
+static dar_tensor copy_to(dar_arena *a, const dar_tensor *x)
+{
+    if (!x->data) return *x;
+    dar_tensor y = dar_tensor_push(a, x->dtype, x->shape);
+    if (!a->plan) dar_tensor_copy(&y, x);
+    return y;
+}
+
+/* ---------------------------------------------------------------- backward */
+
+static size_t grad_bytes(const dar_val *v)
+{
+    return dar_tensor_count(&v->x) * dar_dtype_size(dar_compute_type(v->x.dtype));
+}
+
+static void ensure_grad(dar_tape *t, dar_val *v)
+{
+    if (v->g.data) return;
+    size_t bytes = grad_bytes(v);
+    void *data = NULL;
+    for (struct dar_spare **p = &t->spare; *p && !data; p = &(*p)->next) {
+        if ((*p)->bytes != bytes) continue;
+        data = (*p)->data;
+        *p = (*p)->next;
+        break;
+    }
+    if (!data) data = dar_arena_push(t->arena, bytes);
+    v->g = dar_tensor_of(dar_compute_type(v->x.dtype), v->x.shape, data);
+}
+
+static void release_grad(dar_tape *t, dar_val *v)
+{
+    if (v->leaf) return;
+    struct dar_spare *s = push_meta(t, sizeof *s);
+    *s = (struct dar_spare){ t->spare, grad_bytes(v), v->g.data };
+    t->spare = s;
+    v->g.data = NULL;
+    v->has_grad = false;
+}
+
+static void clear_grad(dar_tape *t, dar_val *v)
+{
+    ensure_grad(t, v);
+    if (!v->has_grad && !t->arena->plan) dar_tensor_fill(&v->g, 0);
+    v->has_grad = true;
+}
+
+static void view_backward(dar_tape *t, const dar_node *node)
+{
+    dar_val *x = node->in[0];
+    clear_grad(t, x);
+    if (t->arena->plan) return;
+    dar_tensor part = node->op->view(&x->g, node->attr);
+    dar_tensor_add(&part, &node->y->g);
+}
+
+static void op_backward(dar_tape *t, const dar_node *node)
+{
+    const dar_op *op = node->op;
+    dar_opctx c = { .attr = node->attr, .y = node->y->x, .aux = node->aux, .gy = node->y->g };
+
+    fill_inputs(&c, node->in, node->n);
+    for (int i = 0; i < node->n; i++) {
+        dar_val *v = node->in[i];
+        if (!grad_goes_to(op, v, i)) continue;
+        for (int j = 0; j < i; j++)
+            if (node->in[j] == v) clear_grad(t, v); /* two inputs, one gradient: both add */
+    }
+    for (int i = 0; i < node->n; i++) {
+        dar_val *v = node->in[i];
+        if (!grad_goes_to(op, v, i)) continue;
+        ensure_grad(t, v);
+        c.gx[i] = v->g;
+        c.add[i] = v->has_grad;
+    }
+    run(t, op, &c, true);
+    for (int i = 0; i < node->n; i++) {
+        if (!c.gx[i].data) continue;
+        node->in[i]->has_grad = true;
+        look(t, op->name, &c.gx[i], true);
+    }
+}
+
+static void sweep(dar_tape *t);
+
+static void segment_backward(dar_tape *t, const dar_node *node)
+{
+    dar_val *in[DAR_OP_IN] = { 0 };
+
+    for (int i = 0; i < node->n; i++)
+        if (node->in[i] && node->in[i]->wants_grad) ensure_grad(t, node->in[i]); /* before the mark: it stays */
+
+    dar_mark m = dar_arena_mark(t->arena), mm = dar_arena_mark(&t->meta);
+    struct dar_spare *spare = t->spare;
+    struct dar_keeping *kept = t->kept;
+    bool replaying = t->replaying;
+    dar_node *last = t->last;
+
+    for (int i = 0; i < node->n; i++) {
+        for (int j = 0; j < i; j++)
+            if (node->in[j] == node->in[i]) in[i] = in[j];
+        if (!node->in[i] || in[i]) continue;
+        in[i] = push_meta(t, sizeof *in[i]);
+        *in[i] = *node->in[i];
+        in[i]->leaf = true; /* its gradient is not the segment's to free */
+    }
+    t->spare = NULL;
+    t->last = NULL;
+    t->kept = node->kept;
+    t->kept->at = 0;
+    t->replaying = true;
+
+    dar_val *y = node->fn(t, node->arg, in);
+    if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
+    y->g = node->y->g;
+    y->has_grad = true;
+    bool own = y->leaf;
+    y->leaf = true;
+    sweep(t);
+    y->leaf = own;
+
+    for (int i = 0; i < node->n; i++)
+        if (in[i]) node->in[i]->has_grad = in[i]->has_grad;
+    t->spare = spare;
+    t->last = last;
+    t->kept = kept;
+    t->replaying = replaying;
+    dar_arena_reset(t->arena, m);
+    dar_arena_reset(&t->meta, mm);
+}
+
+static void sweep(dar_tape *t)
+{
+    bool recording = t->recording;
+    t->recording = true; /* for the replay of segments */
+    for (dar_node *node = t->last; node; node = node->prev) {
+        if (!node->y->has_grad) continue;
+        if (!node->op) segment_backward(t, node);
+        else if (node->op->view) view_backward(t, node);
+        else op_backward(t, node);
+        release_grad(t, node->y);
+    }
+    t->last = NULL;
+    t->recording = recording;
+}
+
+void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed)
+{
+    DAR_ASSERT(y->wants_grad, "backward: nothing that led here wants a gradient");
+    DAR_ASSERT(seed || dar_tensor_count(&y->x) == 1, "backward: %zu elements need a seed", dar_tensor_count(&y->x));
+    ensure_grad(t, y);
+    if (!t->arena->plan) {
+        if (seed && y->has_grad) dar_tensor_add(&y->g, seed);
+        else if (seed) dar_tensor_copy(&y->g, seed);
+        else dar_tensor_fill(&y->g, 1);
+    }
+    y->has_grad = true;
+    sweep(t);
+}
+
+/* ---------------------------------------------------------------- segments */
+
+dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const *in, int n, dar_dtype type,
+                     dar_shape shape)
+{
+    DAR_ASSERT(n >= 0 && n <= DAR_OP_IN, "segment: %d inputs, at most %d", n, DAR_OP_IN);
+    dar_val *y = push_val(t, dar_tensor_push(t->arena, type, shape));
+    dar_node *node = push_meta(t, sizeof *node);
+    *node =
+        (dar_node){ .prev = t->last, .n = n, .y = y, .fn = fn, .arg = arg, .kept = push_meta(t, sizeof *node->kept) };
+    for (int i = 0; i < n; i++) node->in[i] = in[i];
+
+    dar_mark m = dar_arena_mark(t->arena), mm = dar_arena_mark(&t->meta);
+    bool recording = t->recording, touched = t->touched;
+    struct dar_keeping *kept = t->kept;
+    bool replaying = t->replaying;
+    t->recording = t->touched = t->replaying = false;
+    t->kept = recording && t->keep ? node->kept : NULL;
+
+    dar_val *r = fn(t, arg, in);
+    char a[96], b[96];
+    DAR_ASSERT(r->x.dtype == type && dar_shape_equal(&r->x.shape, &shape), "segment: result %s %s, announced %s %s",
+               dar_dtype_name(r->x.dtype), dar_shape_text(&r->x.shape, a, sizeof a), dar_dtype_name(type),
+               dar_shape_text(&shape, b, sizeof b));
+    if (!t->arena->plan) dar_tensor_copy(&y->x, &r->x);
+    dar_arena_reset(t->arena, m);
+    dar_arena_reset(&t->meta, mm);
+
+    bool wants = recording && t->touched;
+    t->recording = recording;
+    t->touched |= touched;
+    t->kept = kept;
+    t->replaying = replaying;
+    if (wants) {
+        y->wants_grad = true;
+        t->last = node;
+    }
+    return y;
+}
+
+dar_val *dar_apply_kept(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr)
+{
+    struct dar_keeping *k = t->kept;
+
+    if (k && t->replaying && k->at < k->n) return call(t, op, in, n, attr, &k->of[k->at++], NULL);
+    if (k && !t->replaying && k->n < MAX_KEPT) {
+        struct kept made;
+        dar_val *y = call(t, op, in, n, attr, NULL, &made);
+        k->of[k->n++] = (struct kept){ copy_to(t->keep, &made.y), copy_to(t->keep, &made.aux) };
+        return y;
+    }
+    return call(t, op, in, n, attr, NULL, NULL);
+}

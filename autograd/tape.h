@@ -1,0 +1,93 @@
+/* tape.h: recording, the backward sweep, recompute segments.
+ *
+ * An op runs when it is called.  If recording is on and an input wants a gradient, a node is pushed; backward walks the
+ * nodes in reverse.  Values, nodes and gradients lie in the step arena: resetting it frees the step.  Inference is the
+ * same code with recording off.
+ *
+ * On a planning arena nothing is computed: the same calls only count bytes and FLOPs, so a program knows its peak
+ * before it starts. */
+#ifndef DAR_AUTOGRAD_TAPE_H
+#define DAR_AUTOGRAD_TAPE_H
+
+#include <stdbool.h>
+
+#include "autograd/op.h"
+#include "lib/arena.h"
+#include "lib/tensor.h"
+
+/* A value on the tape.  Lives in the step arena (leaves may live anywhere). */
+typedef struct dar_val {
+    dar_tensor x; /* the value */
+    dar_tensor g; /* its gradient, in the arithmetic type; data NULL until backward reaches it */
+    bool wants_grad;
+    bool has_grad; /* g holds something to add to */
+    bool leaf;     /* g is the owner's memory: kept, and added to from step to step */
+} dar_val;
+
+typedef struct dar_node dar_node;
+struct dar_spare;
+struct dar_keeping;
+
+/* What a step did, or would do. */
+typedef struct dar_cost {
+    double forward, backward; /* [FLOP]; recomputation counts as forward */
+    size_t ops;               /* calls of forward and backward */
+} dar_cost;
+
+typedef struct dar_tape {
+    dar_arena *arena; /* values, gradients, scratch: the step's memory */
+    dar_arena *keep;  /* results that outlive a segment's forward (dar_apply_kept); NULL: none are kept */
+    dar_arena meta;   /* nodes and val structs: small, real even when arena only plans */
+    bool recording;
+    bool check_finite; /* look at every result and gradient; costs a read of each */
+    dar_cost cost;
+
+    /* With check_finite: the first op that made a NaN or Inf, else NULL. */
+    const char *bad_op;
+    bool bad_backward; /* it was a gradient */
+    int64_t bad_index;
+
+    /* Of the tape itself. */
+    dar_node *last;           /* newest node */
+    struct dar_spare *spare;  /* gradient buffers that are free again */
+    struct dar_keeping *kept; /* of the segment being run or replayed */
+    bool replaying;
+    bool touched; /* an input of an op since the segment began wants a gradient */
+} dar_tape;
+
+/* An empty tape over an initialised arena, recording.  Reserves address space for the nodes. */
+dar_status dar_tape_init(dar_tape *t, dar_arena *arena, dar_err *e);
+
+/* Release the nodes' memory.  Accepts a zeroed tape. */
+void dar_tape_free(dar_tape *t);
+
+/* Forget nodes and values, spare buffers, cost and bad_op.  The arenas are the caller's to reset. */
+void dar_tape_clear(dar_tape *t);
+
+/* A value over memory of the caller, pushed on the arena.  g: gradient memory of the arithmetic type and x's shape that
+ * backward adds to, or NULL for a frozen input. */
+dar_val *dar_leaf(dar_tape *t, dar_tensor x, const dar_tensor *g);
+
+/* A leaf without memory of its own: x is pushed, content undefined (planning: only counted). */
+dar_val *dar_input(dar_tape *t, dar_dtype type, dar_shape s);
+
+/* Run op on n inputs (NULL: absent).  attr is copied.  Inputs that are strided views are copied to contiguous memory
+ * first. */
+dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr);
+
+/* Gradients of the scalar (or, with seed, of <seed, y>) with respect to every leaf that wants one.  Clears the tape's
+ * nodes.  seed: y's shape, arithmetic type; NULL only for one element. */
+void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed);
+
+/* A recompute segment: y = fn(inputs).  Only inputs and y are kept; backward runs fn again, recording, and sweeps it.
+ * fn must depend on nothing but its inputs, arg and leaves, and may be called several times.  It returns the result, of
+ * type and shape given here.  Temporaries of fn are freed before this returns, with recording off too. */
+typedef dar_val *dar_segment_fn(dar_tape *t, void *arg, dar_val *const *in);
+dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const *in, int n, dar_dtype type,
+                     dar_shape shape);
+
+/* Run op as dar_apply does; inside a segment, keep its result and statistics in the keep arena, so that the replay need
+ * not compute it again.  Worth it where recomputation is dear and results are small: attention. */
+dar_val *dar_apply_kept(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr);
+
+#endif

@@ -1,0 +1,107 @@
+/* thread.c: the only place that starts threads. */
+#include "lib/thread.h"
+
+#include <omp.h>
+
+#include "lib/status.h"
+
+static int wanted; /* 0: ask OpenMP */
+static _Thread_local int self;
+
+int dar_threads(void)
+{
+    return wanted ? wanted : omp_get_max_threads();
+}
+
+void dar_threads_set(int n)
+{
+    DAR_ASSERT(n >= 1, "threads: %d, expected at least 1", n);
+    wanted = n;
+}
+
+void dar_parallel(size_t tasks, dar_task *fn, void *ctx)
+{
+    int n = dar_threads();
+
+    if ((size_t)n > tasks) n = (int)tasks;
+    if (n <= 1 || omp_in_parallel()) {
+        for (size_t i = 0; i < tasks; i++) fn(ctx, i, self);
+        return;
+    }
+#pragma omp parallel num_threads(n)
+    {
+        self = omp_get_thread_num();
+#pragma omp for schedule(dynamic, 1)
+        for (size_t i = 0; i < tasks; i++) fn(ctx, i, self);
+        self = 0;
+    }
+}
+
+struct range {
+    size_t n, chunk;
+    dar_range_task *fn;
+    void *ctx;
+};
+
+static void run_range(void *ctx, size_t i, int thread)
+{
+    const struct range *r = ctx;
+    size_t begin = i * r->chunk, end = begin + r->chunk < r->n ? begin + r->chunk : r->n;
+    r->fn(r->ctx, begin, end, thread);
+}
+
+void dar_parallel_range(size_t n, size_t chunk, dar_range_task *fn, void *ctx)
+{
+    DAR_ASSERT(chunk > 0, "threads: chunks of 0 items");
+    struct range r = { n, chunk, fn, ctx };
+    dar_parallel(n / chunk + (n % chunk != 0), run_range, &r);
+}
+
+double dar_sum_tree(double *x, size_t n)
+{
+    if (!n) return 0;
+    for (size_t step = 1; step < n; step *= 2)
+        for (size_t i = 0; i + step < n; i += 2 * step) x[i] += x[i + step];
+    return x[0];
+}
+
+/* The chunks are summed in groups that fit on the stack, the groups by the same tree again. */
+#define GROUP 256
+
+struct sum {
+    size_t n, chunk, first;
+    dar_sum_task *fn;
+    void *ctx;
+    double part[GROUP];
+};
+
+static void run_sum(void *ctx, size_t i, int thread)
+{
+    struct sum *s = ctx;
+    size_t begin = (s->first + i) * s->chunk, end = begin + s->chunk < s->n ? begin + s->chunk : s->n;
+    (void)thread;
+    s->part[i] = s->fn(s->ctx, begin, end);
+}
+
+double dar_parallel_sum(size_t n, size_t chunk, dar_sum_task *fn, void *ctx)
+{
+    DAR_ASSERT(chunk > 0, "threads: chunks of 0 items");
+    struct sum s = { .n = n, .chunk = chunk, .fn = fn, .ctx = ctx };
+    size_t chunks = n / chunk + (n % chunk != 0);
+    double level[64] = { 0 }; /* binary counter of finished groups: level[k] holds a sum of 2^k groups */
+    unsigned long long full = 0;
+
+    for (; s.first < chunks; s.first += GROUP) {
+        size_t m = chunks - s.first < GROUP ? chunks - s.first : GROUP;
+        dar_parallel(m, run_sum, &s);
+        double x = dar_sum_tree(s.part, m);
+        int k = 0;
+        for (; full >> k & 1; k++) x = level[k] + x;
+        level[k] = x;
+        full++; /* clears the levels just folded and sets level k */
+    }
+    double total = 0;
+    for (int k = 0; k < 64; k++)
+        if (full >> k & 1) total = level[k] + total;
+    return total;
+}

@@ -1,0 +1,120 @@
+/* tile.c: the table of tiles, and packing. */
+#include "lib/tile.h"
+
+#include <string.h>
+
+#include "lib/cpu.h"
+#include "lib/status.h"
+
+/* ---------------------------------------------------------------- reference tiles */
+
+#define DEF_MM(NAME, A, B, C, UNIT)                                                                                    \
+    static void NAME(size_t k, const void *a_, size_t a_row, size_t a_k, const void *b_, size_t b_k, void *c_,         \
+                     size_t ldc, size_t m, size_t n, bool add)                                                         \
+    {                                                                                                                  \
+        const A *a = a_;                                                                                               \
+        const B *b = b_;                                                                                               \
+        C *c = c_;                                                                                                     \
+        for (size_t i = 0; i < m; i++)                                                                                 \
+            for (size_t j = 0; j < n; j++) {                                                                           \
+                C s = add ? c[i * ldc + j] : 0;                                                                        \
+                for (size_t p = 0; p < k; p++)                                                                         \
+                    for (size_t u = 0; u < UNIT; u++)                                                                  \
+                        s += (C)a[(i * a_row + p * a_k) * UNIT + u] * (C)b[(p * b_k + j) * UNIT + u];                  \
+                c[i * ldc + j] = s;                                                                                    \
+            }                                                                                                          \
+    }
+DEF_MM(mm_f64, double, double, double, 1)
+DEF_MM(mm_f32, float, float, float, 1)
+DEF_MM(mm_i8, uint8_t, int8_t, int32_t, 4)
+
+static const dar_tile ref[DAR_TILE_KINDS] = {
+    [DAR_TILE_F64] = { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64 },
+    [DAR_TILE_F32] = { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32 },
+    [DAR_TILE_I8] = { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8 },
+};
+
+static const dar_tile *table[DAR_TILE_KINDS];
+
+void dar_tile_init(unsigned cpu_flags)
+{
+    (void)cpu_flags;
+    for (int i = 0; i < DAR_TILE_KINDS; i++) table[i] = ref[i].mm ? &ref[i] : NULL;
+}
+
+dar_tile_kind dar_tile_kind_for(dar_dtype t)
+{
+    if (t == DAR_F64) return DAR_TILE_F64;
+    return t == DAR_BF16 && (dar_cpu_flags() & DAR_CPU_BF16) && table[DAR_TILE_BF16] ? DAR_TILE_BF16 : DAR_TILE_F32;
+}
+
+const dar_tile *dar_tile_for(dar_tile_kind kind, size_t n)
+{
+    (void)n;
+    dar_cpu_flags();
+    DAR_ASSERT(table[kind], "tile: kind %d is not to be had on this processor", (int)kind);
+    return table[kind];
+}
+
+/* ---------------------------------------------------------------- packing */
+
+size_t dar_tile_units(const dar_tile *t, size_t k)
+{
+    return (k + t->unit - 1) / t->unit;
+}
+
+size_t dar_tile_bytes_a(const dar_tile *t, size_t k)
+{
+    return dar_tile_units(t, k) * t->mr * t->unit_bytes;
+}
+
+size_t dar_tile_bytes_b(const dar_tile *t, size_t k)
+{
+    return dar_tile_units(t, k) * t->nr * t->unit_bytes;
+}
+
+static dar_dtype operand(const dar_tile *t)
+{
+    static const dar_dtype of[] = { DAR_F64, DAR_F32, DAR_BF16, DAR_I8 };
+    return of[t->kind];
+}
+
+/* Stripe of `wide` lanes: element (lane j, k) of the stored matrix is at src[j * lane + k * step]. */
+static void pack(const dar_tile *t, dar_dtype src_type, const void *src, size_t lane, size_t step, size_t lanes,
+                 size_t k, size_t wide, void *dst)
+{
+    dar_dtype to = operand(t);
+    size_t es = dar_dtype_size(to);
+
+    memset(dst, 0, dar_tile_units(t, k) * wide * t->unit_bytes);
+    for (size_t p = 0; p < k; p++)
+        for (size_t j = 0; j < lanes; j++) {
+            size_t from = j * lane + p * step, at = (p / t->unit * wide + j) * t->unit + p % t->unit;
+            if (to == DAR_I8) ((uint8_t *)dst)[at] = ((const uint8_t *)src)[from];
+            else dar_dtype_set(to, (char *)dst + at * es, 0, dar_dtype_get(src_type, src, from));
+        }
+}
+
+void dar_tile_pack_a_mk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
+                        void *dst)
+{
+    pack(t, src_type, src, ld, 1, m, k, t->mr, dst);
+}
+
+void dar_tile_pack_a_km(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
+                        void *dst)
+{
+    pack(t, src_type, src, 1, ld, m, k, t->mr, dst);
+}
+
+void dar_tile_pack_b_kn(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
+                        void *dst)
+{
+    pack(t, src_type, src, 1, ld, n, k, t->nr, dst);
+}
+
+void dar_tile_pack_b_nk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
+                        void *dst)
+{
+    pack(t, src_type, src, ld, 1, n, k, t->nr, dst);
+}

@@ -1,0 +1,70 @@
+/* tile.h: register tiles, the one place where products are computed.
+ *
+ * A tile multiplies a packed stripe of A (mr rows) with a packed stripe of B (nr columns) into C.  Operands are packed
+ * in units of 8 bytes (f64) or 4: one f32, a bf16 pair, or an 8-bit quad, consecutive along k.  Everything that
+ * multiplies (matrix product, attention, convolution) packs its operands for a tile and calls it, so precision and
+ * instruction set are chosen here alone.
+ *
+ *   kind         A          B          C     how
+ *   DAR_TILE_F64  f64        f64        f64   reference
+ *   DAR_TILE_F32  f32        f32        f32   fused multiply-add where the processor has it
+ *   DAR_TILE_BF16 bf16       bf16       f32   pairs; denormals flush to zero
+ *   DAR_TILE_I8   u8         s8         i32   quads, exact
+ *
+ * Order of summation: k ascending within a unit of k, one accumulator per element of C (bf16: one per element, pairs
+ * added as the processor does), so a result depends on how the caller cuts k and on nothing else. */
+#ifndef DAR_LIB_TILE_H
+#define DAR_LIB_TILE_H
+
+#include <stdbool.h>
+#include <stddef.h>
+
+#include "lib/dtype.h"
+
+typedef enum dar_tile_kind { DAR_TILE_F64, DAR_TILE_F32, DAR_TILE_BF16, DAR_TILE_I8, DAR_TILE_KINDS } dar_tile_kind;
+
+typedef struct dar_tile {
+    const char *name; /* "f32 6x64 avx512" */
+    dar_tile_kind kind;
+    size_t unit;       /* elements along k per unit: 1, 1, 2, 4 */
+    size_t unit_bytes; /* 8, 4, 4, 4 */
+    size_t mr, nr;     /* rows of A, columns of B in a stripe */
+
+    /* C[m, n] (+)= A B with m <= mr, n <= nr over k units.
+     *   a: unit (i, k) at a + i * a_row + k * a_k     [units]; the packed stripe has a_row = 1, a_k = mr
+     *   b: unit (k, j) at b + k * b_k + j             [units]; nr columns are readable; the packed stripe has b_k = nr
+     *   c: element (i, j) at c + i * ldc + j; elements outside [m, n] are neither read nor written
+     * k = 0 clears C unless add. */
+    void (*mm)(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c, size_t ldc,
+               size_t m, size_t n, bool add);
+} dar_tile;
+
+/* The kind that multiplies operands stored as t fastest here: f64 -> F64; bf16 -> BF16 where the processor has it, else
+ * F32; everything else F32.  i8 is asked for by name. */
+dar_tile_kind dar_tile_kind_for(dar_dtype t);
+
+/* The tile of that kind that wastes least on n columns. */
+const dar_tile *dar_tile_for(dar_tile_kind kind, size_t n);
+
+/* Units of k that hold k elements, and bytes of a packed stripe over them. */
+size_t dar_tile_units(const dar_tile *t, size_t k);
+size_t dar_tile_bytes_a(const dar_tile *t, size_t k);
+size_t dar_tile_bytes_b(const dar_tile *t, size_t k);
+
+/* Pack one stripe, converting from the stored type; the rest of the stripe (rows past m, columns past n, k to a whole
+ * unit) is zero.  `ld` is the distance between stored rows [elements].  Sources: f64, f32, bf16, f16 for the float
+ * kinds; bytes (DAR_I8) for DAR_TILE_I8. a_mk: src[m][k]     a_km: src[k][m] (A is stored transposed) b_kn: src[k][n]
+ * b_nk: src[n][k] (B is stored transposed: weights [out, in]) */
+void dar_tile_pack_a_mk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
+                        void *dst);
+void dar_tile_pack_a_km(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
+                        void *dst);
+void dar_tile_pack_b_kn(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
+                        void *dst);
+void dar_tile_pack_b_nk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
+                        void *dst);
+
+/* Fill the table for a set of DAR_CPU_ flags; called by dar_cpu_init. */
+void dar_tile_init(unsigned cpu_flags);
+
+#endif
