@@ -26,7 +26,8 @@ LIBS     := -lopenblas -lcjson -lm
 # Instruction sets per file, read by the one compile rule.
 AVX2   := -mavx2 -mfma -mf16c
 AVX512 := $(AVX2) -mavx512f -mavx512bw -mavx512vl -mavx512dq -mprefer-vector-width=512
-isa     = $(if $(filter %_avx2,$1),$(AVX2))$(if $(filter %_avx512,$1),$(AVX512))$(if $(filter %_bf16,$1),$(AVX512) -mavx512bf16)$(if $(filter %_vnni,$1),$(AVX512) -mavx512vnni)
+isa     = $(if $(filter %_avx2,$1),$(AVX2)) $(if $(filter %_avx512,$1),$(AVX512)) \
+          $(if $(filter %_bf16,$1),$(AVX512) -mavx512bf16) $(if $(filter %_vnni,$1),$(AVX512) -mavx512vnni)
 
 ROOMS := lib autograd autograd/ops models data
 SRC   := $(wildcard $(addsuffix /*.c,$(ROOMS)))
@@ -34,7 +35,9 @@ OBJ   := $(SRC:%.c=$B/%.o)
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
 FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 
-.PHONY: all test test-built check stress bench-kernels ulp fuzz deps clean help FORCE
+HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
+
+.PHONY: all everything headers test test-built check lint stress bench-kernels ulp fuzz deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
 all: $B/libdar.a ## build the library and the programs
@@ -73,7 +76,17 @@ test: deps ## install what is missing, build, run every test; the last line coun
 test-built: $(TESTS:%=$B/%)
 	@scripts/run-tests.sh $B $(TESTS)
 
-check: ## layers, style, headers alone, clang-format; then gcc, clang and sanitizer builds with their tests
+everything: all $(TESTS:%=$B/%)
+
+headers: $(HDR:%=alone/%)
+
+alone/%:
+	@echo '#include "$*"' | $(CC) $(CFLAGS) -fsyntax-only -x c -
+
+lint: ## the quick half of check: layers, style, format, headers alone
+	@scripts/check.sh static
+
+check: ## lint, then gcc, clang, debug and sanitizer builds, tests in release and under sanitizers
 	@scripts/check.sh
 
 clean: ## remove build/

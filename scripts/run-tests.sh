@@ -5,9 +5,10 @@
 build=$1
 shift
 passed=0 failed=0 skipped=0 bad=0
+export ASAN_OPTIONS="${ASAN_OPTIONS:-handle_segv=2:detect_leaks=1}" CMOCKA_MESSAGE_OUTPUT=STDOUT
 for t in "$@"; do
     start=$(date +%s.%N)
-    ASAN_OPTIONS=${ASAN_OPTIONS:-handle_segv=2:detect_leaks=1} CMOCKA_MESSAGE_OUTPUT=STDOUT "$build/$t" >"$build/$t.log" 2>&1
+    "$build/$t" >"$build/$t.log" 2>&1
     status=$?
     end=$(date +%s.%N)
     p=$(grep -c '^\[       OK \]' "$build/$t.log")
