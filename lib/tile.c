@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "lib/cpu.h"
+#include "lib/kern_tiles.h"
 #include "lib/status.h"
 
 /* ---------------------------------------------------------------- reference tiles */
@@ -17,43 +18,72 @@
         C *c = c_;                                                                                                     \
         for (size_t i = 0; i < m; i++)                                                                                 \
             for (size_t j = 0; j < n; j++) {                                                                           \
-                C s = add ? c[i * ldc + j] : 0;                                                                        \
+                C s = 0;                                                                                               \
                 for (size_t p = 0; p < k; p++)                                                                         \
                     for (size_t u = 0; u < UNIT; u++)                                                                  \
                         s += (C)a[(i * a_row + p * a_k) * UNIT + u] * (C)b[(p * b_k + j) * UNIT + u];                  \
-                c[i * ldc + j] = s;                                                                                    \
+                c[i * ldc + j] = add ? c[i * ldc + j] + s : s;                                                         \
             }                                                                                                          \
     }
 DEF_MM(mm_f64, double, double, double, 1)
 DEF_MM(mm_f32, float, float, float, 1)
 DEF_MM(mm_i8, uint8_t, int8_t, int32_t, 4)
 
-static const dar_tile ref[DAR_TILE_KINDS] = {
-    [DAR_TILE_F64] = { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64 },
-    [DAR_TILE_F32] = { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32 },
-    [DAR_TILE_I8] = { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8 },
+static const dar_tile ref[] = {
+    { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64, NULL },
+    { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32, NULL },
+    { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8, NULL },
 };
 
-static const dar_tile *table[DAR_TILE_KINDS];
+/* ---------------------------------------------------------------- the table */
+
+static dar_tile_set table[DAR_TILE_KINDS];
 
 void dar_tile_init(unsigned cpu_flags)
 {
+    memset(table, 0, sizeof table);
+    for (size_t i = 0; i < DAR_COUNT(ref); i++) table[ref[i].kind] = (dar_tile_set){ &ref[i], 1 };
+#if defined __x86_64__
+    if (cpu_flags & DAR_CPU_AVX2) table[DAR_TILE_F32] = dar_tiles_f32_avx2, table[DAR_TILE_I8] = dar_tiles_i8_avx2;
+    if (cpu_flags & DAR_CPU_AVX512) table[DAR_TILE_F32] = dar_tiles_f32_avx512;
+    if (cpu_flags & DAR_CPU_BF16) table[DAR_TILE_BF16] = dar_tiles_bf16;
+    if (cpu_flags & DAR_CPU_VNNI) table[DAR_TILE_I8] = dar_tiles_i8_vnni;
+#else
     (void)cpu_flags;
-    for (int i = 0; i < DAR_TILE_KINDS; i++) table[i] = ref[i].mm ? &ref[i] : NULL;
+#endif
 }
 
 dar_tile_kind dar_tile_kind_for(dar_dtype t)
 {
     if (t == DAR_F64) return DAR_TILE_F64;
-    return t == DAR_BF16 && (dar_cpu_flags() & DAR_CPU_BF16) && table[DAR_TILE_BF16] ? DAR_TILE_BF16 : DAR_TILE_F32;
+    return t == DAR_BF16 && (dar_cpu_flags() & DAR_CPU_BF16) ? DAR_TILE_BF16 : DAR_TILE_F32;
+}
+
+/* x rounded up to whole stripes of s. */
+static double whole(size_t x, size_t s)
+{
+    return (double)(x / s + (x % s != 0)) * (double)s;
+}
+
+/* Least work, counting what lies in stripes but outside [m, n]; the widest of equals, since a wide tile reads least. */
+const dar_tile *dar_tile_fit(dar_tile_kind kind, size_t m, size_t n)
+{
+    dar_cpu_flags(); /* fills the table at first use */
+    const dar_tile *best = NULL;
+    double least = 0;
+
+    for (int i = 0; i < table[kind].n; i++) {
+        const dar_tile *t = &table[kind].of[i];
+        double work = whole(m, t->mr) * whole(n, t->nr);
+        if (!best || work < least) best = t, least = work;
+    }
+    DAR_ASSERT(best, "tile: kind %d is not to be had on this processor", (int)kind);
+    return best;
 }
 
 const dar_tile *dar_tile_for(dar_tile_kind kind, size_t n)
 {
-    (void)n;
-    dar_cpu_flags();
-    DAR_ASSERT(table[kind], "tile: kind %d is not to be had on this processor", (int)kind);
-    return table[kind];
+    return dar_tile_fit(kind, 48, n); /* whole stripes of every shape */
 }
 
 /* ---------------------------------------------------------------- packing */
@@ -80,8 +110,8 @@ static dar_dtype operand(const dar_tile *t)
 }
 
 /* Stripe of `wide` lanes: element (lane j, k) of the stored matrix is at src[j * lane + k * step]. */
-static void pack(const dar_tile *t, dar_dtype src_type, const void *src, size_t lane, size_t step, size_t lanes,
-                 size_t k, size_t wide, void *dst)
+static void pack_slow(const dar_tile *t, dar_dtype src_type, const void *src, size_t lane, size_t step, size_t lanes,
+                      size_t k, size_t wide, void *dst)
 {
     dar_dtype to = operand(t);
     size_t es = dar_dtype_size(to);
@@ -95,26 +125,35 @@ static void pack(const dar_tile *t, dar_dtype src_type, const void *src, size_t 
         }
 }
 
+static void pack(const dar_tile *t, bool along, dar_dtype src_type, const void *src, size_t ld, size_t lanes, size_t k,
+                 size_t wide, void *dst)
+{
+    dar_pack_fn *fn = t->pack ? (along ? t->pack->along : t->pack->across)[src_type] : NULL;
+
+    if (fn) fn(src, ld, lanes, k, wide, dst);
+    else pack_slow(t, src_type, src, along ? ld : 1, along ? 1 : ld, lanes, k, wide, dst);
+}
+
 void dar_tile_pack_a_mk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
                         void *dst)
 {
-    pack(t, src_type, src, ld, 1, m, k, t->mr, dst);
+    pack(t, true, src_type, src, ld, m, k, t->mr, dst);
 }
 
 void dar_tile_pack_a_km(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
                         void *dst)
 {
-    pack(t, src_type, src, 1, ld, m, k, t->mr, dst);
+    pack(t, false, src_type, src, ld, m, k, t->mr, dst);
 }
 
 void dar_tile_pack_b_kn(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
                         void *dst)
 {
-    pack(t, src_type, src, 1, ld, n, k, t->nr, dst);
+    pack(t, false, src_type, src, ld, n, k, t->nr, dst);
 }
 
 void dar_tile_pack_b_nk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
                         void *dst)
 {
-    pack(t, src_type, src, ld, 1, n, k, t->nr, dst);
+    pack(t, true, src_type, src, ld, n, k, t->nr, dst);
 }

@@ -11,8 +11,9 @@
  *   DAR_TILE_BF16 bf16       bf16       f32   pairs; denormals flush to zero
  *   DAR_TILE_I8   u8         s8         i32   quads, exact
  *
- * Order of summation: k ascending within a unit of k, one accumulator per element of C (bf16: one per element, pairs
- * added as the processor does), so a result depends on how the caller cuts k and on nothing else. */
+ * Order of summation: from zero, k ascending, one accumulator per element of C (bf16: pairs added as the processor
+ * does); then, with `add`, that sum to what C holds.  So a result depends on how the caller cuts k and on nothing else.
+ */
 #ifndef DAR_LIB_TILE_H
 #define DAR_LIB_TILE_H
 
@@ -23,6 +24,14 @@
 
 typedef enum dar_tile_kind { DAR_TILE_F64, DAR_TILE_F32, DAR_TILE_BF16, DAR_TILE_I8, DAR_TILE_KINDS } dar_tile_kind;
 
+/* Pack `lanes` lanes of k elements into a stripe of `wide` lanes; see dar_tile_pack_*. */
+typedef void dar_pack_fn(const void *src, size_t ld, size_t lanes, size_t k, size_t wide, void *dst);
+
+typedef struct dar_packers {
+    dar_pack_fn *along[DAR_DTYPES];  /* by stored type, a lane's elements consecutive; NULL: by plain loops */
+    dar_pack_fn *across[DAR_DTYPES]; /* the lanes of one k consecutive */
+} dar_packers;
+
 typedef struct dar_tile {
     const char *name; /* "f32 6x64 avx512" */
     dar_tile_kind kind;
@@ -31,20 +40,22 @@ typedef struct dar_tile {
     size_t mr, nr;     /* rows of A, columns of B in a stripe */
 
     /* C[m, n] (+)= A B with m <= mr, n <= nr over k units.
-     *   a: unit (i, k) at a + i * a_row + k * a_k     [units]; the packed stripe has a_row = 1, a_k = mr
-     *   b: unit (k, j) at b + k * b_k + j             [units]; nr columns are readable; the packed stripe has b_k = nr
-     *   c: element (i, j) at c + i * ldc + j; elements outside [m, n] are neither read nor written
-     * k = 0 clears C unless add. */
+     *   a: unit (i, k) at a + i * a_row + k * a_k     [units]; the packed stripe has a_row = 1, a_k = mr, and mr rows
+     * are readable; with any other strides rows past m are not read b: unit (k, j) at b + k * b_k + j [units]; nr
+     * columns are readable; the packed stripe has b_k = nr c: element (i, j) at c + i * ldc + j; elements outside [m,
+     * n] are neither read nor written k = 0 clears C unless add. */
     void (*mm)(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c, size_t ldc,
                size_t m, size_t n, bool add);
+    const dar_packers *pack; /* NULL: by plain loops */
 } dar_tile;
 
 /* The kind that multiplies operands stored as t fastest here: f64 -> F64; bf16 -> BF16 where the processor has it, else
  * F32; everything else F32.  i8 is asked for by name. */
 dar_tile_kind dar_tile_kind_for(dar_dtype t);
 
-/* The tile of that kind that wastes least on n columns. */
+/* The tile of that kind that wastes least on n columns; dar_tile_fit: on m rows and n columns. */
 const dar_tile *dar_tile_for(dar_tile_kind kind, size_t n);
+const dar_tile *dar_tile_fit(dar_tile_kind kind, size_t m, size_t n);
 
 /* Units of k that hold k elements, and bytes of a packed stripe over them. */
 size_t dar_tile_units(const dar_tile *t, size_t k);
@@ -53,8 +64,10 @@ size_t dar_tile_bytes_b(const dar_tile *t, size_t k);
 
 /* Pack one stripe, converting from the stored type; the rest of the stripe (rows past m, columns past n, k to a whole
  * unit) is zero.  `ld` is the distance between stored rows [elements].  Sources: f64, f32, bf16, f16 for the float
- * kinds; bytes (DAR_I8) for DAR_TILE_I8. a_mk: src[m][k]     a_km: src[k][m] (A is stored transposed) b_kn: src[k][n]
- * b_nk: src[n][k] (B is stored transposed: weights [out, in]) */
+ * kinds; bytes (DAR_I8) for DAR_TILE_I8.
+ *
+ *   a_mk: src[m][k]    a_km: src[k][m] (A is stored transposed)
+ *   b_kn: src[k][n]    b_nk: src[n][k] (B is stored transposed: weights [out, in]) */
 void dar_tile_pack_a_mk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
                         void *dst);
 void dar_tile_pack_a_km(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,

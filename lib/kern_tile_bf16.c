@@ -1,0 +1,100 @@
+/* kern_tile_bf16.c: bf16 tiles (VDPBF16PS: a pair of products per lane and instruction), and their packing. */
+#include <immintrin.h>
+
+#include "lib/kern_tiles.h"
+#include "lib/kern_transpose_avx512.inc"
+
+#define W    16
+#define UNIT 2
+
+typedef float elem;
+typedef __m512 acc;
+typedef __m512bh bvec, avec;
+
+#define zero()           _mm512_setzero_ps()
+#define load_b(p)        (__m512bh) _mm512_loadu_si512(p)
+#define load_a(p)        (__m512bh) _mm512_set1_epi32(*(p))
+#define mul_add(c, a, b) _mm512_dpbf16_ps(c, a, b)
+#define get_c(p, n)      _mm512_maskz_loadu_ps(first(n), p)
+#define put_c(p, n, c)   _mm512_mask_storeu_ps(p, first(n), c)
+#define add_c(c, d)      _mm512_add_ps(c, d)
+
+#include "lib/kern_tile.inc"
+
+TILE(mm_6x64, 6, 4)
+TILE(mm_8x48, 8, 3)
+TILE(mm_12x32, 12, 2)
+TILE(mm_24x16, 24, 1)
+
+/* n <= 16 elements as f32. */
+static inline __m512 get_f32(const void *p, size_t n)
+{
+    return _mm512_maskz_loadu_ps(first(n), p);
+}
+
+static inline __m512 get_f16(const void *p, size_t n)
+{
+    return _mm512_cvtph_ps(_mm256_maskz_loadu_epi16(first(n), p));
+}
+
+/* 32 elements along k are 16 pairs as they come. */
+static inline units along_bf16(const void *p, size_t n)
+{
+    return _mm512_maskz_loadu_epi16(n < 32 ? (1u << n) - 1 : ~0u, p);
+}
+
+#define ALONG(NAME, SIZE, GET)                                                                                         \
+    static inline units NAME(const void *p, size_t n)                                                                  \
+    {                                                                                                                  \
+        const char *high = (const char *)p + 16 * SIZE;                                                                \
+        return (units)_mm512_cvtne2ps_pbh(GET(n > 16 ? high : p, n > 16 ? n - 16 : 0), GET(p, n < 16 ? n : 16));       \
+    }
+ALONG(along_f32, 4, get_f32)
+ALONG(along_f16, 2, get_f16)
+
+/* Rows k and k + 1 (or one alone) interleaved. */
+static inline units pairs(__m256i low, __m256i high)
+{
+    return _mm512_or_si512(_mm512_cvtepu16_epi32(low), _mm512_slli_epi32(_mm512_cvtepu16_epi32(high), 16));
+}
+
+static inline __m256i row_bf16(const void *p, size_t n)
+{
+    return _mm256_maskz_loadu_epi16(first(n), p);
+}
+
+static inline __m256i row_f32(const void *p, size_t n)
+{
+    return (__m256i)_mm512_cvtneps_pbh(get_f32(p, n));
+}
+
+static inline __m256i row_f16(const void *p, size_t n)
+{
+    return (__m256i)_mm512_cvtneps_pbh(get_f16(p, n));
+}
+
+#define ACROSS(NAME, ROW)                                                                                              \
+    static inline units NAME(const void *p, size_t ld, size_t rows, size_t n)                                          \
+    {                                                                                                                  \
+        return pairs(ROW(p, n), ROW(rows > 1 ? (const char *)p + ld : p, rows > 1 ? n : 0));                           \
+    }
+ACROSS(across_f32, row_f32)
+ACROSS(across_bf16, row_bf16)
+ACROSS(across_f16, row_f16)
+
+PACK(f32, 4, along_f32, across_f32)
+PACK(bf16, 2, along_bf16, across_bf16)
+PACK(f16, 2, along_f16, across_f16)
+
+static const dar_packers pack = {
+    .along = { [DAR_F32] = f32_along, [DAR_BF16] = bf16_along, [DAR_F16] = f16_along },
+    .across = { [DAR_F32] = f32_across, [DAR_BF16] = bf16_across, [DAR_F16] = f16_across },
+};
+
+static const dar_tile of[] = {
+    { "bf16 6x64 avx512", DAR_TILE_BF16, 2, 4, 6, 64, mm_6x64, &pack },
+    { "bf16 8x48 avx512", DAR_TILE_BF16, 2, 4, 8, 48, mm_8x48, &pack },
+    { "bf16 12x32 avx512", DAR_TILE_BF16, 2, 4, 12, 32, mm_12x32, &pack },
+    { "bf16 24x16 avx512", DAR_TILE_BF16, 2, 4, 24, 16, mm_24x16, &pack },
+};
+const dar_tile_set dar_tiles_bf16 = { of, 4 };
