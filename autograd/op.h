@@ -4,12 +4,18 @@
  * listed once, in ops.def.  The tape (autograd/tape.h) calls it; nothing else does.
  *
  * Contract
- *   forward    overwrites y, and aux if it is there (aux.data is NULL when nobody will call backward).
- *   backward   for each i with gx[i].data: gx[i] = (add[i] ? gx[i] : 0) + J_i^T gy.  Reads only x[i], y named in
- * `keep`, aux and gy. neither    allocates, or keeps state; scratch comes with the context, of the size that `scratch`
- * asked for. Every tensor is contiguous.  Storage types may differ from input to input; arithmetic is f64 if y or x[0]
- * is f64, else f32 or wider.  Gradients and aux are of the arithmetic type.  Results have the same bits for any number
- * of threads. */
+ *
+ *   forward   Overwrites y, and aux if it is there (aux.data is NULL when nobody will call backward).
+ *
+ *   backward  For each i with gx[i].data: gx[i] = (add[i] ? gx[i] : 0) + J_i^T gy.  Reads aux, gy, and of the x[i]
+ *             and y only those named in `keep`.  The gx[i] never overlap.
+ *
+ *   both      Allocate nothing and keep no state; scratch comes with the context, of the size that `scratch` asked
+ *             for.  Every tensor is contiguous.  The same bits for any number of threads.
+ *
+ *   types     Storage differs from input to input as it likes, but an input that gets a gradient is f64 only if x[0]
+ *             is.  Arithmetic is f64 if y or x[0] is f64, else f32 or wider; aux is of that type.  A gradient is f64
+ *             if its value is, else f32. */
 #ifndef DAR_AUTOGRAD_OP_H
 #define DAR_AUTOGRAD_OP_H
 
@@ -34,7 +40,7 @@ typedef struct dar_opctx {
 
 /* One set of inputs for the table test.  Values are uniform in [lo, hi] (both 0: [-1, 1]) unless `fill` sets them. */
 typedef struct dar_sample {
-    dar_shape in[DAR_OP_IN]; /* n = -1: absent */
+    dar_shape in[DAR_OP_IN]; /* n = -1: absent; ends the inputs of a variadic op */
     const void *attr;        /* NULL if the op has none */
     double lo, hi;
     double gap;                                   /* keep |x| >= gap: distance from a kink at 0 */
@@ -68,6 +74,9 @@ typedef struct dar_op {
     dar_shape (*aux)(const dar_shape *in, int n_in, const void *attr);
     /* Bytes of scratch; NULL: none.  Tensors in c have shapes and types but may have no memory. */
     size_t (*scratch)(const dar_opctx *c, bool backward);
+    /* Terms of the longest sum behind an element of y (of = -1) or of the gradient of x[of]; from it the tests derive
+     * what f32 and bf16 may be off.  NULL: elementwise, 1. */
+    double (*terms)(const dar_shape *in, int n_in, const void *attr, int of);
     /* Floating-point operations of one call, for the gradients that are wanted; NULL: not counted. */
     double (*flops)(const dar_opctx *c, bool backward);
 
