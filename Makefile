@@ -33,6 +33,7 @@ ROOMS := lib autograd autograd/ops models data
 SRC   := $(wildcard $(addsuffix /*.c,$(ROOMS)))
 OBJ   := $(SRC:%.c=$B/%.o)
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
+BENCH := $(patsubst %.c,$B/%.o,$(wildcard tests/bench_*.c))
 FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
@@ -45,6 +46,7 @@ all: $B/libdar.a ## build the library and the programs
 help: ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-14s %s\n", $$1, $$2}' Makefile
 	@echo "  MODE=release|debug|asan, CC=gcc|clang"
+	@echo "  bench-kernels: QUICK=1, FILTER=text, CPU=none|avx2|avx512|bf16|vnni"
 
 deps: ## install the Debian packages that are missing
 	@scripts/install-deps.sh
@@ -76,7 +78,17 @@ test: deps ## install what is missing, build, run every test; the last line coun
 test-built: $(TESTS:%=$B/%)
 	@scripts/run-tests.sh $B $(TESTS)
 
-everything: all $(TESTS:%=$B/%)
+$B/bench_kernels: $(BENCH) $B/libdar.a
+	@echo "LD $@"
+	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS)
+
+bench-kernels: deps ## speed of every kernel as a fraction of the machine's peak: table, build/bench/kernels.csv
+	@$(MAKE) --no-print-directory $B/bench_kernels
+	@mkdir -p build/bench
+	@$B/bench_kernels build/bench/kernels.csv \
+		$(if $(QUICK),quick) $(if $(FILTER),'filter=$(FILTER)') $(if $(CPU),cpu=$(CPU))
+
+everything: all $(TESTS:%=$B/%) $B/bench_kernels
 
 headers: $(HDR:%=alone/%)
 
