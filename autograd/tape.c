@@ -56,12 +56,11 @@ void dar_tape_free(dar_tape *t)
 
 void dar_tape_clear(dar_tape *t)
 {
-    dar_arena_reset(&t->meta, 0);
-    t->last = NULL;
-    t->spare = NULL;
-    t->bad_op = NULL;
-    t->bad_backward = false;
-    t->cost = (dar_cost){ 0 };
+    dar_tape fresh = {
+        .arena = t->arena, .keep = t->keep, .meta = t->meta, .recording = t->recording, .check_finite = t->check_finite
+    };
+    dar_arena_reset(&fresh.meta, 0);
+    *t = fresh;
 }
 
 static void *push_meta(dar_tape *t, size_t bytes)
@@ -134,6 +133,13 @@ static bool grad_goes_to(const dar_op *op, const dar_val *v, int i)
     return v && v->wants_grad && !(op->frozen & DAR_KEEP_X(i));
 }
 
+/* A value from outside a segment would get its gradient in memory that the replay gives back. */
+static void check_origin(const dar_tape *t, const dar_val *v)
+{
+    DAR_ASSERT(!v || !v->wants_grad || v->leaf || (const void *)v >= t->oldest,
+               "segment: fn uses a value that is neither its input nor a leaf");
+}
+
 static void fill_inputs(dar_opctx *c, dar_val *const *in, int n)
 {
     for (int i = 0; i < DAR_OP_IN; i++) {
@@ -155,6 +161,7 @@ static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n
     check_inputs(op, given, n);
     for (int i = 0; i < n; i++) {
         in[i] = given[i];
+        check_origin(t, in[i]);
         if (in[i] && !op->view && !op->strided && !dar_tensor_contiguous(&in[i]->x)) in[i] = dar_contiguous(t, in[i]);
         wants |= grad_goes_to(op, in[i], i);
     }
@@ -166,6 +173,10 @@ static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n
         type[i] = c.x[i].dtype;
     }
     dar_shape s = op->shape(shape, n, attr);
+    for (int i = 1; i < n && wants; i++)
+        DAR_ASSERT(!grad_goes_to(op, in[i], i) || dar_compute_type(type[i]) == dar_compute_type(type[0]),
+                   "%s: input %d is %s and wants a gradient, input 0 is %s", op->name, i, dar_dtype_name(type[i]),
+                   dar_dtype_name(type[0]));
     DAR_ASSERT(!wants || op->backward || op->view, "%s: no gradient: %s", op->name, op->no_backward);
 
     if (ready) c.y = ready->y;
@@ -228,7 +239,7 @@ static void ensure_grad(dar_tape *t, dar_val *v)
 
 static void release_grad(dar_tape *t, dar_val *v)
 {
-    if (v->leaf) return;
+    if (v->leaf || !v->g.data) return;
     struct dar_spare *s = push_meta(t, sizeof *s);
     *s = (struct dar_spare){ t->spare, grad_bytes(v), v->g.data };
     t->spare = s;
@@ -236,64 +247,90 @@ static void release_grad(dar_tape *t, dar_val *v)
     v->has_grad = false;
 }
 
-static void clear_grad(dar_tape *t, dar_val *v)
-{
-    ensure_grad(t, v);
-    if (!v->has_grad && !t->arena->plan) dar_tensor_fill(&v->g, 0);
-    v->has_grad = true;
-}
-
 static void view_backward(dar_tape *t, const dar_node *node)
 {
-    dar_val *x = node->in[0];
-    clear_grad(t, x);
-    if (t->arena->plan) return;
-    dar_tensor part = node->op->view(&x->g, node->attr);
-    dar_tensor_add(&part, &node->y->g);
+    dar_val *x = node->in[0], *y = node->y;
+    bool whole = dar_tensor_count(&x->x) == dar_tensor_count(&y->x);
+
+    if (whole && !x->g.data && !y->leaf && dar_tensor_contiguous(&x->x) && dar_tensor_contiguous(&y->x)) {
+        x->g = dar_tensor_reshape(&y->g, x->x.shape); /* the same numbers in the same order: hand the buffer on */
+        y->g.data = NULL;
+    } else {
+        ensure_grad(t, x);
+        dar_tensor part = node->op->view(&x->g, node->attr);
+        if (!x->has_grad && !whole && !t->arena->plan) dar_tensor_fill(&x->g, 0);
+        if (!t->arena->plan) (x->has_grad ? dar_tensor_add : dar_tensor_copy)(&part, &y->g);
+    }
+    x->has_grad = true;
+}
+
+/* The gradient memory that an earlier input of the same call gets. */
+static bool taken(const dar_opctx *c, int i, const dar_val *v)
+{
+    for (int j = 0; j < i; j++)
+        if (c->gx[j].data == v->g.data) return true;
+    return false;
 }
 
 static void op_backward(dar_tape *t, const dar_node *node)
 {
     const dar_op *op = node->op;
     dar_opctx c = { .attr = node->attr, .y = node->y->x, .aux = node->aux, .gy = node->y->g };
+    bool apart[DAR_OP_IN] = { false };
 
     fill_inputs(&c, node->in, node->n);
+    for (int i = 0; i < node->n; i++)
+        if (grad_goes_to(op, node->in[i], i)) ensure_grad(t, node->in[i]);
+    dar_mark m = dar_arena_mark(t->arena);
     for (int i = 0; i < node->n; i++) {
         dar_val *v = node->in[i];
         if (!grad_goes_to(op, v, i)) continue;
-        for (int j = 0; j < i; j++)
-            if (node->in[j] == v) clear_grad(t, v); /* two inputs, one gradient: both add */
-    }
-    for (int i = 0; i < node->n; i++) {
-        dar_val *v = node->in[i];
-        if (!grad_goes_to(op, v, i)) continue;
-        ensure_grad(t, v);
-        c.gx[i] = v->g;
-        c.add[i] = v->has_grad;
+        apart[i] = taken(&c, i, v); /* one value as two inputs: the op need not know */
+        c.gx[i] = apart[i] ? dar_tensor_push(t->arena, v->g.dtype, v->g.shape) : v->g;
+        c.add[i] = !apart[i] && v->has_grad;
     }
     run(t, op, &c, true);
     for (int i = 0; i < node->n; i++) {
         if (!c.gx[i].data) continue;
-        node->in[i]->has_grad = true;
         look(t, op->name, &c.gx[i], true);
+        if (apart[i] && !t->arena->plan) dar_tensor_add(&node->in[i]->g, &c.gx[i]);
+        node->in[i]->has_grad = true;
     }
+    dar_arena_reset(t->arena, m);
 }
 
 static void sweep(dar_tape *t);
 
-static void segment_backward(dar_tape *t, const dar_node *node)
+/* Where the tape stands before a segment, so that it can stand there again. */
+struct place {
+    dar_tape was;
+    dar_mark arena, keep, meta;
+};
+
+static struct place enter(const dar_tape *t)
 {
-    dar_val *in[DAR_OP_IN] = { 0 };
+    return (struct place){ *t, dar_arena_mark(t->arena), t->keep ? dar_arena_mark(t->keep) : 0,
+                           dar_arena_mark(&t->meta) };
+}
 
-    for (int i = 0; i < node->n; i++)
-        if (node->in[i] && node->in[i]->wants_grad) ensure_grad(t, node->in[i]); /* before the mark: it stays */
+/* Back to p: all that was pushed since is gone, what happened since is remembered. */
+static void leave(dar_tape *t, const struct place *p)
+{
+    t->recording = p->was.recording;
+    t->last = p->was.last;
+    t->spare = p->was.spare;
+    t->oldest = p->was.oldest;
+    t->kept = p->was.kept;
+    t->replaying = p->was.replaying;
+    t->touched |= p->was.touched;
+    dar_arena_reset(t->arena, p->arena);
+    if (t->keep) dar_arena_reset(t->keep, p->keep);
+    dar_arena_reset(&t->meta, p->meta);
+}
 
-    dar_mark m = dar_arena_mark(t->arena), mm = dar_arena_mark(&t->meta);
-    struct dar_spare *spare = t->spare;
-    struct dar_keeping *kept = t->kept;
-    bool replaying = t->replaying;
-    dar_node *last = t->last;
-
+/* Stand-ins for the segment's inputs, sharing value and gradient; the same value stays one value. */
+static void stand_in(dar_tape *t, const dar_node *node, dar_val **in)
+{
     for (int i = 0; i < node->n; i++) {
         for (int j = 0; j < i; j++)
             if (node->in[j] == node->in[i]) in[i] = in[j];
@@ -302,29 +339,32 @@ static void segment_backward(dar_tape *t, const dar_node *node)
         *in[i] = *node->in[i];
         in[i]->leaf = true; /* its gradient is not the segment's to free */
     }
+}
+
+static void segment_backward(dar_tape *t, const dar_node *node)
+{
+    dar_val *in[DAR_OP_IN] = { 0 };
+
+    for (int i = 0; i < node->n; i++)
+        if (node->in[i] && node->in[i]->wants_grad) ensure_grad(t, node->in[i]); /* before the mark: it stays */
+
+    struct place p = enter(t);
     t->spare = NULL;
     t->last = NULL;
+    t->oldest = t->meta.base + t->meta.used;
     t->kept = node->kept;
     t->kept->at = 0;
     t->replaying = true;
-
+    stand_in(t, node, in);
     dar_val *y = node->fn(t, node->arg, in);
     if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
     y->g = node->y->g;
     y->has_grad = true;
-    bool own = y->leaf;
-    y->leaf = true;
+    y->leaf = true; /* nor is this one */
     sweep(t);
-    y->leaf = own;
-
     for (int i = 0; i < node->n; i++)
         if (in[i]) node->in[i]->has_grad = in[i]->has_grad;
-    t->spare = spare;
-    t->last = last;
-    t->kept = kept;
-    t->replaying = replaying;
-    dar_arena_reset(t->arena, m);
-    dar_arena_reset(&t->meta, mm);
+    leave(t, &p);
 }
 
 static void sweep(dar_tape *t)
@@ -344,12 +384,11 @@ static void sweep(dar_tape *t)
 
 void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed)
 {
-    DAR_ASSERT(y->wants_grad, "backward: nothing that led here wants a gradient");
+    DAR_ASSERT(y->wants_grad && !y->leaf, "backward: nothing that led here wants a gradient");
     DAR_ASSERT(seed || dar_tensor_count(&y->x) == 1, "backward: %zu elements need a seed", dar_tensor_count(&y->x));
     ensure_grad(t, y);
     if (!t->arena->plan) {
-        if (seed && y->has_grad) dar_tensor_add(&y->g, seed);
-        else if (seed) dar_tensor_copy(&y->g, seed);
+        if (seed) dar_tensor_copy(&y->g, seed);
         else dar_tensor_fill(&y->g, 1);
     }
     y->has_grad = true;
@@ -361,38 +400,28 @@ void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed)
 dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const *in, int n, dar_dtype type,
                      dar_shape shape)
 {
+    char a[96], b[96];
     DAR_ASSERT(n >= 0 && n <= DAR_OP_IN, "segment: %d inputs, at most %d", n, DAR_OP_IN);
+    for (int i = 0; i < n; i++) check_origin(t, in[i]);
     dar_val *y = push_val(t, dar_tensor_push(t->arena, type, shape));
     dar_node *node = push_meta(t, sizeof *node);
-    *node =
-        (dar_node){ .prev = t->last, .n = n, .y = y, .fn = fn, .arg = arg, .kept = push_meta(t, sizeof *node->kept) };
+    *node = (dar_node){ .prev = t->last, .n = n, .y = y, .fn = fn, .arg = arg };
+    node->kept = push_meta(t, sizeof *node->kept);
     for (int i = 0; i < n; i++) node->in[i] = in[i];
 
-    dar_mark m = dar_arena_mark(t->arena), mm = dar_arena_mark(&t->meta);
-    bool recording = t->recording, touched = t->touched;
-    struct dar_keeping *kept = t->kept;
-    bool replaying = t->replaying;
+    struct place p = enter(t);
     t->recording = t->touched = t->replaying = false;
-    t->kept = recording && t->keep ? node->kept : NULL;
-
+    t->kept = p.was.recording && t->keep ? node->kept : NULL;
     dar_val *r = fn(t, arg, in);
-    char a[96], b[96];
     DAR_ASSERT(r->x.dtype == type && dar_shape_equal(&r->x.shape, &shape), "segment: result %s %s, announced %s %s",
                dar_dtype_name(r->x.dtype), dar_shape_text(&r->x.shape, a, sizeof a), dar_dtype_name(type),
                dar_shape_text(&shape, b, sizeof b));
     if (!t->arena->plan) dar_tensor_copy(&y->x, &r->x);
-    dar_arena_reset(t->arena, m);
-    dar_arena_reset(&t->meta, mm);
-
-    bool wants = recording && t->touched;
-    t->recording = recording;
-    t->touched |= touched;
-    t->kept = kept;
-    t->replaying = replaying;
-    if (wants) {
-        y->wants_grad = true;
-        t->last = node;
-    }
+    t->touched |= r->wants_grad; /* an input or a leaf, handed through */
+    y->wants_grad = p.was.recording && t->touched;
+    if (y->wants_grad && t->keep) p.keep = dar_arena_mark(t->keep); /* the replay needs what was kept */
+    leave(t, &p);
+    if (y->wants_grad) t->last = node;
     return y;
 }
 

@@ -1,8 +1,8 @@
 /* tape.h: recording, the backward sweep, recompute segments.
  *
  * An op runs when it is called.  If recording is on and an input wants a gradient, a node is pushed; backward walks the
- * nodes in reverse.  Values, nodes and gradients lie in the step arena: resetting it frees the step.  Inference is the
- * same code with recording off.
+ * nodes in reverse.  Values and gradients lie in the step arena, nodes in one of the tape's own: dar_tape_clear and a
+ * reset of the step arena free the step.  Inference is the same code with recording off.
  *
  * On a planning arena nothing is computed: the same calls only count bytes and FLOPs, so a program knows its peak
  * before it starts. */
@@ -15,7 +15,7 @@
 #include "lib/arena.h"
 #include "lib/tensor.h"
 
-/* A value on the tape.  Lives in the step arena (leaves may live anywhere). */
+/* A value on the tape, valid until dar_tape_clear. */
 typedef struct dar_val {
     dar_tensor x; /* the value */
     dar_tensor g; /* its gradient, in the arithmetic type; data NULL until backward reaches it */
@@ -50,6 +50,7 @@ typedef struct dar_tape {
     /* Of the tape itself. */
     dar_node *last;           /* newest node */
     struct dar_spare *spare;  /* gradient buffers that are free again */
+    const void *oldest;       /* first value of the segment being replayed */
     struct dar_keeping *kept; /* of the segment being run or replayed */
     bool replaying;
     bool touched; /* an input of an op since the segment began wants a gradient */
@@ -61,7 +62,7 @@ dar_status dar_tape_init(dar_tape *t, dar_arena *arena, dar_err *e);
 /* Release the nodes' memory.  Accepts a zeroed tape. */
 void dar_tape_free(dar_tape *t);
 
-/* Forget nodes and values, spare buffers, cost and bad_op.  The arenas are the caller's to reset. */
+/* Forget nodes and values, spare buffers, cost and bad_op.  The arenas `arena` and `keep` are the caller's to reset. */
 void dar_tape_clear(dar_tape *t);
 
 /* A value over memory of the caller, pushed on the arena.  g: gradient memory of the arithmetic type and x's shape that
@@ -80,8 +81,9 @@ dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, con
 void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed);
 
 /* A recompute segment: y = fn(inputs).  Only inputs and y are kept; backward runs fn again, recording, and sweeps it.
- * fn must depend on nothing but its inputs, arg and leaves, and may be called several times.  It returns the result, of
- * type and shape given here.  Temporaries of fn are freed before this returns, with recording off too. */
+ * fn must depend on nothing but its inputs, arg and leaves (aborts if it uses another value that wants a gradient), and
+ * may be called several times; arg must live until backward.  It returns the result, of type and shape given here.
+ * Temporaries of fn are freed before this returns, with recording off too. */
 typedef dar_val *dar_segment_fn(dar_tape *t, void *arg, dar_val *const *in);
 dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const *in, int n, dar_dtype type,
                      dar_shape shape);
