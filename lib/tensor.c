@@ -16,6 +16,7 @@ size_t dar_shape_count(const dar_shape *s)
         DAR_ASSERT(s->d[i] >= 0, "shape: dimension %d is %lld", i, (long long)s->d[i]);
         n = dar_mul_size(n, (size_t)s->d[i]);
     }
+    DAR_ASSERT(n <= INT64_MAX, "shape: %zu elements, strides hold %lld", n, (long long)INT64_MAX);
     return n;
 }
 

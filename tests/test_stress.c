@@ -1,0 +1,316 @@
+/* test_stress.c: the places where numbers break, one test each: numbers far too large, too small, or not numbers, sums
+ * too long for their type, sizes too large for an int.  What is asked is a right answer, not merely a finite one.
+ *
+ * With the argument "full" (make stress) sizes are those of real clips; otherwise the same tests run on small ones. */
+#include "tests/test.h"
+
+#include <sys/mman.h>
+
+#include "autograd/ops.h"
+#include "lib/kern.h"
+
+static bool full;
+static dar_arena arena;
+static dar_tape tape;
+
+static int setup(void **state)
+{
+    (void)state;
+    dar_arena_reset(&arena, 0);
+    dar_tape_clear(&tape);
+    tape.check_finite = false;
+    return 0;
+}
+
+/* A leaf of f32 values; g: with a zeroed gradient. */
+static dar_val *leaf(dar_shape s, const float *values, bool g)
+{
+    dar_tensor x = dar_tensor_push(&arena, DAR_F32, s), gx = { 0 };
+    if (values) memcpy(x.data, values, dar_tensor_bytes(&x));
+    if (g) {
+        gx = dar_tensor_push(&arena, DAR_F32, s);
+        dar_tensor_fill(&gx, 0);
+    }
+    return dar_leaf(&tape, x, g ? &gx : NULL);
+}
+
+static double at(const dar_tensor *x, size_t i)
+{
+    return dar_dtype_get(x->dtype, x->data, i);
+}
+
+/* ---------------------------------------------------------------- the compiler */
+
+/* a b + c rounded twice, though the processor could do it with one rounding. */
+#if defined __x86_64__
+__attribute__((noinline, target("fma")))
+#else
+__attribute__((noinline))
+#endif
+static double
+product_sum(double a, double b, double c)
+{
+    return a * b + c;
+}
+
+/* Error of a + b.  Source: Knuth, TAOCP 2, 4.2.2, theorem B. */
+static double two_sum_error(double a, double b)
+{
+    double s = a + b, bb = s - a;
+    return (a - (s - bb)) + (b - bb);
+}
+
+static void flags_keep_arithmetic(void **state)
+{
+    (void)state;
+    volatile double zero = 0, one = 1, tiny = 0x1p-60;
+    volatile float least = 0x1p-149f;
+
+    CHECK(isnan(zero / zero) && !(zero / zero == zero / zero), "0/0 is not seen as NaN");
+    CHECK(isinf(one / zero) && !isfinite(one / zero), "1/0 is not seen as infinite");
+    CHECK(signbit(-zero) && 1 / -zero == -INFINITY, "-0 lost its sign");
+    CHECK(least * 2 == 0x1p-148f && least > 0, "denormals flush to zero");
+    CHECK_NEAR("(1 + tiny) - 1 by TwoSum", two_sum_error(one, tiny), 0x1p-60, 0);
+    CHECK((one + tiny) - one == 0, "addition was reassociated");
+
+    /* (1 + 2^-30)^2 = 1 + 2^-29 + 2^-60: the last term survives only in a fused operation. */
+    if (dar_cpu_detect() & DAR_CPU_AVX2) {
+        volatile double x = 1 + 0x1p-30;
+        CHECK_NEAR("contracted product", product_sum(x, x, -(1 + 0x1p-29)), 0, 0);
+    }
+
+    /* Kahan: a million times 1e-8 onto 1, each below half a ulp of f32. */
+    float sum = 1, carry = 0;
+    for (int i = 0; i < 1000000; i++) {
+        volatile float term = 1e-8f;
+        float y = term - carry, t = sum + y;
+        carry = (t - sum) - y;
+        sum = t;
+    }
+    CHECK_NEAR("Kahan sum", sum, 1.01, 1.2e-7);
+}
+
+/* ---------------------------------------------------------------- denormals */
+
+struct denormals {
+    float out[64];
+    unsigned mode[64];
+};
+
+static void halve(void *ctx, size_t i, int thread)
+{
+    struct denormals *d = ctx;
+    volatile float x = 0x1p-126f; /* least normal number */
+    (void)thread;
+    d->out[i] = x / 8;
+#if defined __x86_64__
+    d->mode[i] = __builtin_ia32_stmxcsr() & 0x8040; /* flush to zero, denormals are zero */
+#endif
+}
+
+/* On every thread, after every kind of work, for every CPU level. */
+static void denormals_survive(void **state)
+{
+    (void)state;
+    unsigned level[5], all = dar_cpu_flags();
+    int before = dar_threads(), levels = test_levels(level);
+    enum { N = 1 << 16 };
+    dar_tensor x = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(N));
+    float *v = x.data;
+    for (int i = 0; i < N; i++) v[i] = (float)(i + 1) * 0x1p-145f;
+
+    for (int l = 0; l < levels; l++) {
+        dar_cpu_init(level[l]);
+        dar_threads_set(7);
+        dar_val *y = dar_silu(&tape, dar_leaf(&tape, x, NULL)); /* x/2 + x^2/4: x/2 here, to half a unit */
+        for (size_t i = 0; i < N; i++) CHECK_NEAR("silu of a denormal", at(&y->x, i), 0.5 * at(&x, i), 0x1p-149);
+        struct denormals d = { 0 };
+        dar_parallel(64, halve, &d);
+        for (int i = 0; i < 64; i++)
+            CHECK(d.out[i] == 0x1p-129f && !d.mode[i], "task %d: denormals flush to zero (mode %x)", i, d.mode[i]);
+    }
+    dar_threads_set(before);
+    dar_cpu_init(all);
+}
+
+/* ---------------------------------------------------------------- NaN and infinity have an address */
+
+static void bad_numbers_are_named(void **state)
+{
+    (void)state;
+    static const float bad[] = { NAN, INFINITY, -INFINITY };
+    for (size_t i = 0; i < DAR_COUNT(bad); i++) {
+        float x[37] = { 0 };
+        x[31] = bad[i];
+        setup(NULL);
+        tape.check_finite = true;
+        dar_val *y = dar_silu(&tape, dar_contiguous(&tape, leaf(DAR_SHAPE(37), x, true)));
+        CHECK(tape.bad_op && strcmp(tape.bad_op, "contiguous") == 0 && !tape.bad_backward && tape.bad_index == 31,
+              "%g: reported %s at %lld", bad[i], tape.bad_op ? tape.bad_op : "nothing", (long long)tape.bad_index);
+        (void)y;
+    }
+
+    /* A gradient that overflows is named as one. */
+    float x[3] = { 1, 2, 3 };
+    setup(NULL);
+    tape.check_finite = true;
+    dar_val *y = dar_silu(&tape, leaf(DAR_SHAPE(3), x, true));
+    CHECK(!tape.bad_op, "finite numbers reported as bad by %s", tape.bad_op);
+    dar_tensor seed = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(3));
+    dar_tensor_fill(&seed, 3.2e38);
+    dar_backward(&tape, y, &seed); /* silu'(2) = 1.09 */
+    CHECK(tape.bad_op && strcmp(tape.bad_op, "silu") == 0 && tape.bad_backward && tape.bad_index == 1,
+          "overflow in backward: reported %s at %lld", tape.bad_op ? tape.bad_op : "nothing",
+          (long long)tape.bad_index);
+}
+
+/* ---------------------------------------------------------------- sizes */
+
+#define BEYOND ((int64_t)1 << 31) /* the first index that an int cannot hold */
+
+/* Address space without memory: pages come where they are touched. */
+static void *reserve(size_t bytes)
+{
+    void *p = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+    CHECK(p != MAP_FAILED, "cannot reserve %zu bytes of address space", bytes);
+    return p;
+}
+
+/* Rows far apart: the second one begins past 2^31 elements. */
+static void views_reach_beyond_int(void **state)
+{
+    (void)state;
+    int64_t row = BEYOND + 5;
+    size_t bytes = (size_t)(2 * row) * sizeof(float);
+    float *p = reserve(bytes);
+    dar_tensor x = dar_tensor_of(DAR_F32, DAR_SHAPE(2, row), p);
+    assert_int_equal(dar_tensor_count(&x), 2 * row);
+    assert_int_equal(dar_tensor_bytes(&x), bytes);
+
+    for (int i = 0; i < 7; i++) p[2 * row - 7 + i] = (float)(i + 1);
+    dar_tensor v = dar_tensor_narrow(&x, 1, row - 7, 7);
+    dar_val *y = dar_contiguous(&tape, dar_leaf(&tape, v, NULL));
+    for (size_t i = 0; i < 14; i++) CHECK_NEAR("narrowed", at(&y->x, i), i < 7 ? 0 : (double)(i - 6), 0);
+    dar_tensor w = dar_tensor_permute(&v, (int[]){ 1, 0 });
+    y = dar_silu(&tape, dar_leaf(&tape, w, NULL));
+    for (size_t i = 0; i < 7; i++)
+        CHECK_NEAR("silu of a view", at(&y->x, 2 * i + 1), (double)(i + 1) / (1 + exp(-(double)(i + 1))), 1e-6 * 7);
+
+    /* Written through a view: only what it covers. */
+    dar_tensor_fill(&y->x, 3);
+    dar_tensor_copy(&w, &y->x);
+    dar_tensor_add(&w, &y->x);
+    CHECK_NEAR("last of row 1", p[2 * row - 1], 6, 0);
+    CHECK_NEAR("last of row 0", p[row - 1], 6, 0);
+    CHECK_NEAR("before the view", p[2 * row - 8], 0, 0);
+    munmap(p, bytes);
+}
+
+/* One contiguous tensor past 2^31 elements; its pages are the kernel's page of zeros until written. */
+static void scans_reach_beyond_int(void **state)
+{
+    (void)state;
+    if (!full) return;
+    int64_t n = BEYOND + 1001;
+    uint16_t *p = reserve((size_t)n * 2);
+    dar_tensor x = dar_tensor_of(DAR_BF16, DAR_SHAPE(n), p);
+    p[n - 1] = dar_bf16_from_f32(INFINITY);
+    assert_int_equal(dar_tensor_nonfinite(&x), n - 1);
+    p[n - 1] = dar_bf16_from_f32(2);
+    assert_int_equal(dar_tensor_nonfinite(&x), -1);
+    munmap(p, (size_t)n * 2);
+}
+
+/* 249 frames: 24570 tokens of 18432 values. */
+static void plans_count_beyond_int(void **state)
+{
+    (void)state;
+    dar_arena plan;
+    dar_tape t;
+    assert_int_equal(dar_arena_init_plan(&plan, "plan", NULL), DAR_OK);
+    assert_int_equal(dar_tape_init(&t, &plan, NULL), DAR_OK);
+    dar_val *x = dar_input(&t, DAR_F32, DAR_SHAPE(3, 24570, 18432));
+    dar_silu(&t, x);
+    assert_int_equal(plan.peak, (size_t)2 * 3 * 24570 * 18432 * 4);
+    CHECK_ABORTS(dar_input(&t, DAR_F32, DAR_SHAPE((int64_t)1 << 40, (int64_t)1 << 40)));
+    dar_tape_free(&t);
+    dar_arena_free(&plan);
+}
+
+static void sizes_do_not_wrap(void **state)
+{
+    (void)state;
+    int64_t big = (int64_t)1 << 32;
+    CHECK_ABORTS(dar_shape_count(&DAR_SHAPE(big, big)));
+    CHECK_ABORTS(dar_shape_count(&DAR_SHAPE(big, big / 2)));
+    CHECK_ABORTS(dar_shape_count(&DAR_SHAPE(3, -1)));
+    CHECK_ABORTS(dar_tensor_push(&arena, DAR_I8, DAR_SHAPE(big, big - 1)));
+    CHECK_ABORTS(dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(big, big / 4)));
+    CHECK_ABORTS(dar_tensor_push(&arena, DAR_F64, DAR_SHAPE(big, big / 8)));
+    CHECK_ABORTS(dar_mul_size(SIZE_MAX / 2, 3));
+    CHECK_ABORTS(dar_add_size(SIZE_MAX, 1));
+    assert_int_equal(dar_mul_size(SIZE_MAX / 3, 3), SIZE_MAX);
+    assert_int_equal(dar_mul_size(0, SIZE_MAX), 0);
+}
+
+/* ---------------------------------------------------------------- sums */
+
+struct squares {
+    const float *x;
+};
+
+static double square_sum(void *ctx, size_t begin, size_t end)
+{
+    const struct squares *s = ctx;
+    double sum = 0;
+    for (size_t i = begin; i < end; i++) sum += (double)s->x[i] * s->x[i];
+    return sum;
+}
+
+/* Four million squares, among them a thousand large ones: a running f32 sum loses the small ones beside them. */
+static void long_sums_keep_digits(void **state)
+{
+    (void)state;
+    size_t n = (size_t)4200000;
+    dar_tensor x = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE((int64_t)n));
+    float *v = x.data, naive = 0;
+    long double exact = 0;
+    for (size_t i = 0; i < n; i++) {
+        v[i] = i % 4096 ? sinf((float)(i % 100003) * 0.7f) : 1000;
+        exact += (long double)v[i] * v[i];
+        naive += v[i] * v[i];
+    }
+    CHECK(fabsl(naive - exact) > 1e-4L * exact, "the sample is too easy: a running f32 sum has it right");
+
+    int before = dar_threads();
+    static const int threads[] = { 1, 2, 3, 7 };
+    double first = 0;
+    for (size_t k = 0; k < DAR_COUNT(threads); k++) {
+        dar_threads_set(threads[k]);
+        double sum = dar_parallel_sum(n, 4096, square_sum, &(struct squares){ v });
+        if (!k) first = sum;
+        CHECK_NEAR("sum of squares", sum, (double)exact, 1e-7 * (double)exact);
+        CHECK(memcmp(&sum, &first, sizeof sum) == 0, "%.17g with %d threads, %.17g with 1", sum, threads[k], first);
+    }
+    dar_threads_set(before);
+}
+
+int main(int argc, char **argv)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test_setup(flags_keep_arithmetic, setup),  cmocka_unit_test_setup(denormals_survive, setup),
+        cmocka_unit_test_setup(bad_numbers_are_named, setup),  cmocka_unit_test_setup(long_sums_keep_digits, setup),
+        cmocka_unit_test_setup(views_reach_beyond_int, setup), cmocka_unit_test_setup(scans_reach_beyond_int, setup),
+        cmocka_unit_test_setup(plans_count_beyond_int, setup), cmocka_unit_test_setup(sizes_do_not_wrap, setup),
+    };
+    dar_err e;
+    full = argc > 1 && strcmp(argv[1], "full") == 0;
+    if (dar_arena_init(&arena, "stress", (size_t)4 << 30, &e) != DAR_OK || dar_tape_init(&tape, &arena, &e) != DAR_OK) {
+        fprintf(stderr, "test_stress: %s\n", e.text);
+        return 3;
+    }
+    int failures = cmocka_run_group_tests(tests, NULL, NULL);
+    dar_tape_free(&tape);
+    dar_arena_free(&arena);
+    return failures != 0;
+}
