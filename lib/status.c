@@ -4,6 +4,20 @@
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
+
+/* Text that came from a file stays one line, and a cut one valid UTF-8. */
+static void tidy(char *text, size_t size)
+{
+    size_t n = strlen(text);
+    if (n + 1 == size) {
+        while (n && ((unsigned char)text[n - 1] & 0xc0) == 0x80) n--;
+        if (n && (unsigned char)text[n - 1] >= 0xc0) n--;
+        text[n] = 0;
+    }
+    for (size_t i = 0; i < n; i++)
+        if ((unsigned char)text[i] < 0x20 || text[i] == 0x7f) text[i] = '?';
+}
 
 dar_status dar_fail(dar_err *e, dar_status s, const char *fmt, ...)
 {
@@ -12,6 +26,7 @@ dar_status dar_fail(dar_err *e, dar_status s, const char *fmt, ...)
         va_start(ap, fmt);
         vsnprintf(e->text, sizeof e->text, fmt, ap);
         va_end(ap);
+        tidy(e->text, sizeof e->text);
     }
     return s;
 }

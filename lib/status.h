@@ -15,7 +15,8 @@ typedef enum dar_status {
     DAR_ERR_INTERRUPTED, /* stopped by a signal after saving */
 } dar_status;
 
-/* One line for the person: which file or key, what was found, what was expected.  Cut to fit, always terminated. */
+/* One line for the person: which file or key, what was found, what was expected.  Cut to fit between two characters,
+ * always terminated; control characters, which names from files may hold, are shown as '?'. */
 typedef struct dar_err {
     char text[512];
 } dar_err;
