@@ -15,6 +15,12 @@
 /* y = x sigmoid(x), elementwise.  Source: Elfwing et al. 2018, eq. 4. */
 dar_val *dar_silu(dar_tape *t, dar_val *x);
 
+/* y = x/2 (1 + tanh(sqrt(2/pi) (x + 0.044715 x^3))), elementwise.  Source: Hendrycks and Gimpel 2016, section 2. */
+dar_val *dar_gelu_tanh(dar_tape *t, dar_val *x);
+
+/* y = max(x, 0), elementwise; the slope at 0 is 0. */
+dar_val *dar_relu(dar_tape *t, dar_val *x);
+
 /* ---------------------------------------------------------------- norms and what surrounds them */
 
 /* ---------------------------------------------------------------- products */

@@ -2,7 +2,9 @@
 #include "lib/kern.h"
 
 #include <math.h>
+#include <stdatomic.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "lib/cpu.h"
 #include "lib/kern_sets.h"
@@ -10,12 +12,16 @@
 #include "lib/thread.h"
 
 static dar_kern f32, f64;
+static size_t last_level = (size_t)32 << 20; /* [byte] of cache; this where the system does not say */
 
 void dar_kern_init(unsigned cpu_flags)
 {
-    (void)cpu_flags;
+    long cache = sysconf(_SC_LEVEL3_CACHE_SIZE);
+    if (cache > 0) last_level = (size_t)cache;
     dar_kern_ref_f32(&f32); /* every slot filled first, then better ones over them */
     dar_kern_ref_f64(&f64);
+    if (cpu_flags & DAR_CPU_AVX2) dar_kern_avx2(&f32);
+    if (cpu_flags & DAR_CPU_AVX512) dar_kern_avx512(&f32);
 }
 
 const dar_kern *dar_kern_for(dar_dtype t)
@@ -30,35 +36,115 @@ dar_dtype dar_compute_type(dar_dtype storage)
     return storage == DAR_F64 ? DAR_F64 : DAR_F32;
 }
 
+/* ---------------------------------------------------------------- storage */
+
+dar_put dar_put_for(size_t bytes, bool add)
+{
+    dar_cpu_flags();
+    return add ? DAR_PUT_ADD : bytes > last_level ? DAR_PUT_STREAM : DAR_PUT;
+}
+
 void dar_row_convert(dar_dtype dst_type, void *dst, dar_dtype src_type, const void *src, size_t n)
 {
+    size_t ds = dar_dtype_size(dst_type), ss = dar_dtype_size(src_type);
+    float buf[DAR_PIECE];
+
     if (dst_type == src_type) {
-        memcpy(dst, src, n * dar_dtype_size(dst_type));
-        return;
+        memcpy(dst, src, n * ds);
+    } else if (dst_type == DAR_F64 || dst_type == DAR_F32) {
+        dar_kern_for(dst_type)->get[src_type](n, src, dst);
+    } else if (src_type == DAR_F64 || src_type == DAR_F32) {
+        dar_kern_for(src_type)->put[dst_type](n, src, dst, false);
+    } else {
+        for (size_t i = 0; i < n; i += DAR_PIECE) {
+            size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
+            dar_kern_for(DAR_F32)->get[src_type](m, (const char *)src + i * ss, buf);
+            dar_kern_for(DAR_F32)->put[dst_type](m, buf, (char *)dst + i * ds, false);
+        }
     }
-    for (size_t i = 0; i < n; i++) dar_dtype_set(dst_type, dst, i, dar_dtype_get(src_type, src, i));
 }
 
 const void *dar_row_get(dar_dtype c, dar_dtype stored, const void *src, size_t n, void *buf)
 {
     if (stored == c) return src;
-    dar_row_convert(c, buf, stored, src, n);
+    dar_kern_for(c)->get[stored](n, src, buf);
     return buf;
 }
 
-void dar_row_put(dar_dtype c, const void *x, dar_dtype stored, void *dst, size_t n, bool add)
+void *dar_row_out(dar_dtype c, dar_dtype stored, void *dst, dar_put mode, void *buf)
 {
-    if (!add) {
-        if (x != dst) dar_row_convert(stored, dst, c, x, n);
+    return stored == c && mode == DAR_PUT ? dst : buf;
+}
+
+static void add_row(dar_dtype c, const void *x, dar_dtype stored, void *dst, size_t n)
+{
+    const dar_kern *k = dar_kern_for(c);
+    size_t cs = dar_dtype_size(c), ss = dar_dtype_size(stored);
+    double buf[DAR_PIECE];
+
+    for (size_t i = 0; i < n; i += DAR_PIECE) {
+        size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
+        void *to = (char *)dst + i * ss, *sum = stored == c ? to : (void *)buf;
+        k->add(m, dar_row_get(c, stored, to, m, buf), (const char *)x + i * cs, sum);
+        if (sum != to) k->put[stored](m, sum, to, false);
+    }
+}
+
+void dar_row_put(dar_dtype c, const void *x, dar_dtype stored, void *dst, size_t n, dar_put mode)
+{
+    if (mode == DAR_PUT_ADD) add_row(c, x, stored, dst, n);
+    else if (x != dst) dar_kern_for(c)->put[stored](n, x, dst, mode == DAR_PUT_STREAM);
+}
+
+/* ---------------------------------------------------------------- whole rows */
+
+float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q)
+{
+    dar_dtype c = dar_compute_type(stored);
+    const dar_kern *k = dar_kern_for(c);
+    size_t size = dar_dtype_size(stored);
+    double buf[DAR_PIECE], most = 0;
+
+    for (size_t i = 0; i < n; i += DAR_PIECE) {
+        size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
+        double a = k->max_abs(m, dar_row_get(c, stored, (const char *)x + i * size, m, buf));
+        most = a <= most ? most : a; /* NaN stays */
+        if (!isfinite(most)) break;
+    }
+    float scale = isfinite(most) ? (float)(most / 127) : NAN;
+    for (size_t i = 0; i < n; i += DAR_PIECE) {
+        size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
+        k->quantise(m, dar_row_get(c, stored, (const char *)x + i * size, m, buf), scale, q + i);
+    }
+    return scale;
+}
+
+struct scan {
+    dar_dtype type;
+    const char *x;
+    _Atomic int64_t first; /* INT64_MAX: none yet */
+};
+
+static void scan_range(void *ctx, size_t begin, size_t end, int thread)
+{
+    struct scan *s = ctx;
+    dar_dtype c = dar_compute_type(s->type);
+    double buf[DAR_PIECE];
+    (void)thread;
+    for (size_t i = begin; i < end && (int64_t)i < s->first; i += DAR_PIECE) {
+        size_t m = end - i < DAR_PIECE ? end - i : DAR_PIECE;
+        const void *x = dar_row_get(c, s->type, s->x + i * dar_dtype_size(s->type), m, buf);
+        ptrdiff_t at = dar_kern_for(c)->nonfinite(m, x);
+        if (at < 0) continue;
+        int64_t found = (int64_t)i + at, first = s->first;
+        while (found < first && !atomic_compare_exchange_weak(&s->first, &first, found)) continue;
         return;
     }
-    for (size_t i = 0; i < n; i++)
-        dar_dtype_set(stored, dst, i, dar_dtype_get(stored, dst, i) + dar_dtype_get(c, x, i));
 }
 
 int64_t dar_row_nonfinite(dar_dtype t, const void *x, size_t n)
 {
-    for (size_t i = 0; i < n; i++)
-        if (!isfinite(dar_dtype_get(t, x, i))) return (int64_t)i;
-    return -1;
+    struct scan s = { .type = t, .x = x, .first = INT64_MAX };
+    dar_parallel_range(n, 64 * DAR_PIECE, scan_range, &s);
+    return s.first == INT64_MAX ? -1 : s.first;
 }

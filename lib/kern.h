@@ -3,7 +3,15 @@
  * A row kernel works on n consecutive elements of one arithmetic type, f32 or f64.  The reference text
  * (lib/kern_ref.inc) fills every slot for both types; faster kernels replace f32 slots according to the processor.
  * Storage types come in and go out through dar_row_get and dar_row_put, a piece of a row at a time, so that every op
- * works on every storage type and mixes them freely. */
+ * works on every storage type and mixes them freely:
+ *
+ *     const void *x = dar_row_get(c, x_type, src, n, xbuf);           src itself, or converted into xbuf
+ *     void *y = dar_row_out(c, y_type, dst, mode, ybuf);              dst itself, or ybuf
+ *     k->silu(n, x, y);
+ *     dar_row_put(c, y, y_type, dst, n, mode);                        store, add or stream what is in ybuf
+ *
+ * Bits: kernels that are not marked "bound" give the same bits at every CPU level, the reference included: they round
+ * after every operation.  FTZ and DAZ are never set: denormals are numbers, on every thread. */
 #ifndef DAR_LIB_KERN_H
 #define DAR_LIB_KERN_H
 
@@ -13,12 +21,76 @@
 
 #include "lib/dtype.h"
 
-/* Pointers are to rows of the table's type.  y may equal x.  "_back": gx = (add ? gx : 0) + derivative * gy. */
+/* Normalisation of one row: xhat = (x - mean) rstd, y = xhat w + b.  w NULL: 1; b NULL: 0.  The mean is subtracted in
+ * two parts, so that rows far from zero keep every bit they have; RMS norm is the same with mean 0. */
+typedef struct dar_norm {
+    double mean, rstd;
+    const void *w, *b;
+} dar_norm;
+
+/* One step of AdamW.  m = beta1 m + (1 - beta1) g scale, v likewise of squares,
+ * w -= rate (m fix1 / (sqrt(v fix2) + eps) + decay w).  fix1 = 1 / (1 - beta1^t), fix2 = 1 / (1 - beta2^t) for step
+ * t = 1, 2, ...; scale is that of gradient clipping, else 1.  Source: Loshchilov and Hutter 2019, algorithm 2. */
+typedef struct dar_adamw {
+    double rate, beta1, beta2, eps, decay, fix1, fix2, scale;
+} dar_adamw;
+
+/* Pointers are to rows of the table's type unless said, and need no alignment.  An output may be the same row as an
+ * input, never one that overlaps it otherwise. */
+typedef void dar_kern_map(size_t n, const void *x, void *y);
+typedef void dar_kern_map_back(size_t n, const void *x, const void *gy, void *gx);
+
 typedef struct dar_kern {
     const char *name; /* of the fastest set used: "ref", "avx2", "avx512" */
 
-    void (*silu)(size_t n, const void *x, void *y);
-    void (*silu_back)(size_t n, const void *x, const void *gy, void *gx, bool add);
+    /* From and to storage, by stored type (i8 is NULL).  To 16 bits: nearest even, NaN stays NaN.  stream: write past
+     * the caches. */
+    void (*get[DAR_DTYPES])(size_t n, const void *src, void *x);
+    void (*put[DAR_DTYPES])(size_t n, const void *x, void *dst, bool stream);
+
+    /* y = f(x).  exp, tanh, rsqrt, silu: bound 2 ULP for every argument, exact for NaN, infinities and -0 (silu: its
+     * limits).  gelu_tanh: bound (2 |z| + 5) 2^-24 relative, z = 2 sqrt(2/pi) (x + 0.044715 x^3).  "_back": gx =
+     * f'(x) gy. */
+    dar_kern_map *exp, *tanh, *rsqrt, *silu, *gelu_tanh, *relu;
+    dar_kern_map_back *silu_back, *gelu_tanh_back, *relu_back;
+
+    void (*add)(size_t n, const void *a, const void *b, void *y);                    /* y = a + b */
+    void (*mul)(size_t n, const void *a, const void *b, void *y);                    /* y = a b */
+    void (*scale)(size_t n, double a, const void *x, void *y);                       /* y = a x */
+    void (*axpy)(size_t n, double a, const void *x, void *y);                        /* y += a x */
+    void (*mul_add)(size_t n, const void *a, const void *b, const void *c, void *y); /* y = a b + c */
+
+    /* Reductions.  Element i goes to f64 accumulator i mod 32; the 32 are added as a tree: j and j + 16, then 8, 4, 2,
+     * 1.  Products of f32 are exact in f64. */
+    double (*sum)(size_t n, const void *x);
+    double (*sum_sq)(size_t n, const void *x, double mean); /* of x - mean */
+    double (*dot)(size_t n, const void *a, const void *b);
+    double (*max)(size_t n, const void *x);          /* ignores NaN; -inf if n = 0 */
+    double (*max_abs)(size_t n, const void *x);      /* 0 if n = 0; NaN or inf if an element is */
+    ptrdiff_t (*nonfinite)(size_t n, const void *x); /* index of the first NaN or infinity, or -1 */
+
+    /* Softmax of a row in pieces: m = max, s = sum of exp_sum, y scaled by 1 / s.  exp_sum: y = exp(x - m), returns the
+     * sum; m = -inf (nothing but masked elements): zeros, 0.  Bound 2 ULP of exp.  softmax_back: gx = y (gy - dot) with
+     * dot = <y, gy>. */
+    double (*exp_sum)(size_t n, const void *x, double m, void *y);
+    void (*softmax_back)(size_t n, const void *y, const void *gy, double dot, void *gx);
+
+    /* Norms.  norm_sums: sum[0] += Σ w gy, sum[1] += Σ w gy xhat; gw += gy xhat, gb += gy where they are not NULL.
+     * norm_back: gx = rstd (w gy - mean[0] - xhat mean[1]). */
+    void (*norm)(size_t n, const dar_norm *s, const void *x, void *y);
+    void (*norm_sums)(size_t n, const dar_norm *s, const void *x, const void *gy, double sum[2], void *gw, void *gb);
+    void (*norm_back)(size_t n, const dar_norm *s, const void *x, const void *gy, const double mean[2], void *gx);
+
+    /* Rotate pairs (x[2i], x[2i+1]) by the angles whose cos, sin are the pairs of table; backward: by their negatives.
+     * n elements, n even; the table's `period` elements (even) repeat. */
+    void (*rope)(size_t n, size_t period, const void *x, const void *table, void *y, bool backward);
+
+    /* w, m, v in place. */
+    void (*adamw)(size_t n, const dar_adamw *a, void *w, void *m, void *v, const void *g);
+
+    /* q = x / scale to the nearest, ties to even, in [-127, 127]; and back.  scale 0 or not finite: q = 0. */
+    void (*quantise)(size_t n, const void *x, float scale, int8_t *q);
+    void (*dequantise)(size_t n, const int8_t *q, float scale, void *x);
 } dar_kern;
 
 /* The table for arithmetic in t: DAR_F32 or DAR_F64. */
@@ -30,14 +102,34 @@ dar_dtype dar_compute_type(dar_dtype storage);
 /* Elements per piece: what dar_row_get buffers should hold.  A piece of every operand fits the first-level cache. */
 #define DAR_PIECE 1024
 
+/* How a row is stored: over what is there, added to it, or past the caches. */
+typedef enum dar_put { DAR_PUT, DAR_PUT_ADD, DAR_PUT_STREAM } dar_put;
+
+/* The mode for an output of `bytes` in all: add if asked; stream what is larger than the last-level cache, where the
+ * next reader would not find it anyway. */
+dar_put dar_put_for(size_t bytes, bool add);
+
 /* n elements at src as arithmetic type c (f32 or f64): src itself if it is stored so, else converted into buf. */
 const void *dar_row_get(dar_dtype c, dar_dtype stored, const void *src, size_t n, void *buf);
 
-/* Store n elements x of arithmetic type c at dst; add: to what is there.  Does nothing if dst == x and !add. */
-void dar_row_put(dar_dtype c, const void *x, dar_dtype stored, void *dst, size_t n, bool add);
+/* Where to compute a row that dar_row_put will store: dst itself if that needs no put, else buf. */
+void *dar_row_out(dar_dtype c, dar_dtype stored, void *dst, dar_put mode, void *buf);
+
+/* Store n elements x of arithmetic type c at dst.  Does nothing if dst == x and the mode is not to add. */
+void dar_row_put(dar_dtype c, const void *x, dar_dtype stored, void *dst, size_t n, dar_put mode);
 
 /* Convert n elements; any pair of f64, f32, bf16, f16. */
 void dar_row_convert(dar_dtype dst_type, void *dst, dar_dtype src_type, const void *src, size_t n);
+
+/* Ask for bytes that will be read soon. */
+static inline void dar_row_ahead(const void *p, size_t bytes)
+{
+    for (size_t i = 0; i < bytes; i += 64) __builtin_prefetch((const char *)p + i);
+}
+
+/* Quantise n stored elements: q = x / scale, scale = max |x| / 127.  A zero row gives scale 0; a row that is not finite
+ * gives zeros with scale NaN, so that it stays visible.  Returns the scale. */
+float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q);
 
 /* Index of the first NaN or Inf of n elements, or -1.  Runs on all threads. */
 int64_t dar_row_nonfinite(dar_dtype t, const void *x, size_t n);

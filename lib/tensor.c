@@ -159,7 +159,7 @@ static void put_row(const struct walk *w, char *to, const char *from, size_t n)
     for (size_t i = 0; i < n; i += DAR_PIECE) {
         size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
         const void *x = dar_row_get(c, w->src->dtype, from + i * dar_dtype_size(w->src->dtype), m, buf);
-        dar_row_put(c, x, w->dst->dtype, to + i * dar_dtype_size(w->dst->dtype), m, true);
+        dar_row_put(c, x, w->dst->dtype, to + i * dar_dtype_size(w->dst->dtype), m, DAR_PUT_ADD);
     }
 }
 

@@ -47,6 +47,12 @@ size_t dar_tensor_count(const dar_tensor *x);
 size_t dar_tensor_bytes(const dar_tensor *x); /* of a contiguous tensor, with its scales */
 bool dar_tensor_contiguous(const dar_tensor *x);
 
+/* Address of element i of a contiguous tensor. */
+static inline void *dar_tensor_at(const dar_tensor *x, size_t i)
+{
+    return (char *)x->data + i * dar_dtype_size(x->dtype);
+}
+
 /* Length of the last dimension, and how many such rows there are.  A scalar is one row of one. */
 size_t dar_tensor_cols(const dar_tensor *x);
 size_t dar_tensor_rows(const dar_tensor *x);

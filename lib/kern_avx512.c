@@ -1,0 +1,192 @@
+/* kern_avx512.c: the row kernels in vectors of 16. */
+#include "lib/kern_sets.h"
+
+#include <math.h>
+#include <string.h>
+
+#if defined __AVX512F__ && defined __AVX512BW__ && defined __AVX512VL__ && defined __AVX512DQ__
+#    include <immintrin.h>
+
+#    define LANES    16
+#    define NAME(x)  x##_avx512
+#    define SET_NAME "avx512"
+
+typedef __m512 vf;    /* LANES f32 */
+typedef __m512d vd;   /* LANES / 2 f64 */
+typedef __m256i vh;   /* LANES 16-bit values */
+typedef __mmask16 vm; /* a choice per lane */
+
+static inline vf v_load(const float *p)
+{
+    return _mm512_loadu_ps(p);
+}
+
+static inline void v_store(float *p, vf x)
+{
+    _mm512_storeu_ps(p, x);
+}
+
+static inline void v_stream(float *p, vf x)
+{
+    _mm512_stream_ps(p, x);
+}
+
+static inline vf v_set(float x)
+{
+    return _mm512_set1_ps(x);
+}
+
+static inline vf v_fma(vf a, vf b, vf c)
+{
+    return _mm512_fmadd_ps(a, b, c);
+}
+
+static inline vf v_max(vf a, vf b)
+{
+    return _mm512_max_ps(a, b);
+}
+
+static inline vf v_min(vf a, vf b)
+{
+    return _mm512_min_ps(a, b);
+}
+
+static inline vf v_sqrt(vf x)
+{
+    return _mm512_sqrt_ps(x);
+}
+
+static inline vf v_round(vf x)
+{
+    return _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+}
+
+static inline vf v_abs(vf x)
+{
+    return _mm512_abs_ps(x);
+}
+
+static inline vf v_sign_from(vf x, vf sign)
+{
+    return _mm512_or_ps(x, _mm512_and_ps(_mm512_set1_ps(-0.0f), sign));
+}
+
+static inline vm v_less(vf a, vf b)
+{
+    return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ);
+}
+
+static inline vf v_select(vm m, vf yes, vf no)
+{
+    return _mm512_mask_blend_ps(m, no, yes);
+}
+
+/* x 2^n for whole n, rounded once. */
+static inline vf v_scale(vf x, vf n)
+{
+    return _mm512_scalef_ps(x, n);
+}
+
+static inline vf v_even(vf x)
+{
+    return _mm512_moveldup_ps(x);
+}
+
+static inline vf v_odd(vf x)
+{
+    return _mm512_movehdup_ps(x);
+}
+
+static inline vf v_swap(vf x)
+{
+    return _mm512_permute_ps(x, 0xb1);
+}
+
+/* a - b in even lanes, a + b in odd ones: a product with 1 rounds nothing. */
+static inline vf v_addsub(vf a, vf b)
+{
+    return _mm512_fmaddsub_ps(a, _mm512_set1_ps(1), b);
+}
+
+static inline vd d_low(vf x)
+{
+    return _mm512_cvtps_pd(_mm512_castps512_ps256(x));
+}
+
+static inline vd d_high(vf x)
+{
+    return _mm512_cvtps_pd(_mm512_extractf32x8_ps(x, 1));
+}
+
+static inline vd d_fma(vd a, vd b, vd c)
+{
+    return _mm512_fmadd_pd(a, b, c);
+}
+
+/* Lanes j and j + 4, then j + 2, then j + 1. */
+static inline double d_sum(vd x)
+{
+    __m256d q = _mm512_castpd512_pd256(x) + _mm512_extractf64x4_pd(x, 1);
+    __m128d s = _mm256_castpd256_pd128(q) + _mm256_extractf128_pd(q, 1);
+    return s[0] + s[1];
+}
+
+static inline vh h_load(const void *p)
+{
+    return _mm256_loadu_si256(p);
+}
+
+static inline void h_store(void *p, vh x)
+{
+    _mm256_storeu_si256(p, x);
+}
+
+static inline void h_stream(void *p, vh x)
+{
+    _mm256_stream_si256(p, x);
+}
+
+static inline vf v_from_bf16(vh h)
+{
+    return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(h), 16));
+}
+
+/* Not VCVTNEPS2BF16: that one flushes denormals. */
+static inline vh v_to_bf16(vf x)
+{
+    __m512i u = _mm512_castps_si512(x), high = _mm512_srli_epi32(u, 16);
+    __m512i odd = _mm512_and_si512(high, _mm512_set1_epi32(1));
+    __m512i r = _mm512_add_epi32(u, _mm512_add_epi32(odd, _mm512_set1_epi32(0x7fff)));
+    __mmask16 nan = _mm512_cmp_ps_mask(x, x, _CMP_UNORD_Q);
+    r = _mm512_srli_epi32(r, 16);
+    return _mm512_cvtepi32_epi16(_mm512_mask_or_epi32(r, nan, high, _mm512_set1_epi32(0x40)));
+}
+
+static inline vf v_from_f16(vh h)
+{
+    return _mm512_cvtph_ps(h);
+}
+
+static inline vh v_to_f16(vf x)
+{
+    return _mm512_cvtps_ph(x, _MM_FROUND_TO_NEAREST_INT);
+}
+
+static inline vf v_from_i8(const int8_t *p)
+{
+    return _mm512_cvtepi32_ps(_mm512_cvtepi8_epi32(_mm_loadu_si128((const void *)p)));
+}
+
+/* Whole numbers in [-127, 127]. */
+static inline void v_to_i8(int8_t *p, vf x)
+{
+    _mm_storeu_si128((void *)p, _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(x)));
+}
+
+#    include "lib/kern_simd.inc"
+#else
+void dar_kern_avx512(dar_kern *k)
+{
+    (void)k;
+}
+#endif
