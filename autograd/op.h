@@ -80,7 +80,8 @@ typedef struct dar_op {
     /* Floating-point operations of one call, for the gradients that are wanted; NULL: not counted. */
     double (*flops)(const dar_opctx *c, bool backward);
 
-    /* A view: y is this view of x[0] and forward, backward are NULL; the tape does both. */
+    /* A view: y is this view of x[0], which aborts if it does not fit; shape, forward and backward are NULL.  Takes
+     * strided x if `strided`. */
     dar_tensor (*view)(const dar_tensor *x, const void *attr);
 
     void (*forward)(const dar_opctx *c);

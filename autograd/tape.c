@@ -121,13 +121,6 @@ static void run(dar_tape *t, const dar_op *op, dar_opctx *c, bool backward)
     dar_arena_reset(t->arena, m);
 }
 
-static void check_inputs(const dar_op *op, dar_val *const *in, int n)
-{
-    int least = op->variadic ? 1 : op->n_in - op->n_optional;
-    DAR_ASSERT(n >= least && n <= op->n_in, "%s: %d inputs, expected %d to %d", op->name, n, least, op->n_in);
-    for (int i = 0; i < least; i++) DAR_ASSERT(in[i], "%s: input %d is NULL", op->name, i);
-}
-
 static bool grad_goes_to(const dar_op *op, const dar_val *v, int i)
 {
     return v && v->wants_grad && !(op->frozen & DAR_KEEP_X(i));
@@ -140,6 +133,19 @@ static void check_origin(const dar_tape *t, const dar_val *v)
                "segment: fn uses a value that is neither its input nor a leaf");
 }
 
+static void check_inputs(const dar_tape *t, const dar_op *op, dar_val *const *in, int n)
+{
+    int least = op->variadic ? 1 : op->n_in - op->n_optional;
+    DAR_ASSERT(n >= least && n <= op->n_in, "%s: %d inputs, expected %d to %d", op->name, n, least, op->n_in);
+    for (int i = 0; i < n; i++) {
+        DAR_ASSERT(in[i] || (i >= least && !op->variadic), "%s: input %d is NULL", op->name, i);
+        check_origin(t, in[i]);
+        DAR_ASSERT(!grad_goes_to(op, in[i], i) || dar_compute_type(in[i]->x.dtype) == dar_compute_type(in[0]->x.dtype),
+                   "%s: input %d is %s and wants a gradient, input 0 is %s", op->name, i,
+                   dar_dtype_name(in[i]->x.dtype), dar_dtype_name(in[0]->x.dtype));
+    }
+}
+
 static void fill_inputs(dar_opctx *c, dar_val *const *in, int n)
 {
     for (int i = 0; i < DAR_OP_IN; i++) {
@@ -148,56 +154,63 @@ static void fill_inputs(dar_opctx *c, dar_val *const *in, int n)
     }
 }
 
+/* y and, where backward will want it, aux: computed, or known from before. */
+static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool save, const struct kept *ready)
+{
+    dar_shape shape[DAR_OP_IN];
+    dar_dtype type[DAR_OP_IN];
+
+    if (ready) {
+        c->y = ready->y;
+        c->aux = ready->aux;
+        return;
+    }
+    if (op->view) {
+        c->y = op->view(&c->x[0], c->attr);
+        return;
+    }
+    for (int i = 0; i < DAR_OP_IN; i++) {
+        shape[i] = c->x[i].shape;
+        type[i] = c->x[i].dtype;
+    }
+    c->y = dar_tensor_push(t->arena, op->dtype ? op->dtype(type, n, c->attr) : type[0], op->shape(shape, n, c->attr));
+    if (op->aux && save) c->aux = dar_tensor_push(t->arena, dar_op_compute(c), op->aux(shape, n, c->attr));
+    run(t, op, c, false);
+    look(t, op->name, &c->y, false);
+}
+
+static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val *const *in, int n, dar_val *y)
+{
+    dar_node *node = push_meta(t, sizeof *node);
+    void *attr = op->attr_size ? dar_arena_push(&t->meta, op->attr_size) : NULL;
+    if (attr) memcpy(attr, c->attr, op->attr_size);
+    *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = attr, .aux = c->aux };
+    memcpy(node->in, in, (size_t)n * sizeof *in);
+    t->last = node;
+}
+
 /* The call itself.  ready: y and aux are known from before.  made: give y and aux even though nothing is recorded. */
 static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n, const void *attr,
                      const struct kept *ready, struct kept *made)
 {
     dar_val *in[DAR_OP_IN] = { 0 };
     dar_opctx c = { .attr = attr };
-    dar_shape shape[DAR_OP_IN];
-    dar_dtype type[DAR_OP_IN];
     bool wants = false;
 
-    check_inputs(op, given, n);
+    check_inputs(t, op, given, n);
     for (int i = 0; i < n; i++) {
         in[i] = given[i];
-        check_origin(t, in[i]);
-        if (in[i] && !op->view && !op->strided && !dar_tensor_contiguous(&in[i]->x)) in[i] = dar_contiguous(t, in[i]);
+        if (in[i] && !op->strided && !dar_tensor_contiguous(&in[i]->x)) in[i] = dar_contiguous(t, in[i]);
         wants |= grad_goes_to(op, in[i], i);
     }
     t->touched |= wants;
     wants &= t->recording;
-    fill_inputs(&c, in, n);
-    for (int i = 0; i < DAR_OP_IN; i++) {
-        shape[i] = c.x[i].shape;
-        type[i] = c.x[i].dtype;
-    }
-    dar_shape s = op->shape(shape, n, attr);
-    for (int i = 1; i < n && wants; i++)
-        DAR_ASSERT(!grad_goes_to(op, in[i], i) || dar_compute_type(type[i]) == dar_compute_type(type[0]),
-                   "%s: input %d is %s and wants a gradient, input 0 is %s", op->name, i, dar_dtype_name(type[i]),
-                   dar_dtype_name(type[0]));
     DAR_ASSERT(!wants || op->backward || op->view, "%s: no gradient: %s", op->name, op->no_backward);
-
-    if (ready) c.y = ready->y;
-    else if (op->view) c.y = op->view(&c.x[0], attr);
-    else c.y = dar_tensor_push(t->arena, op->dtype ? op->dtype(type, n, attr) : type[0], s);
-    if (ready) c.aux = ready->aux;
-    else if (op->aux && (wants || made)) c.aux = dar_tensor_push(t->arena, dar_op_compute(&c), op->aux(shape, n, attr));
-    if (!ready && !op->view) {
-        run(t, op, &c, false);
-        look(t, op->name, &c.y, false);
-    }
+    fill_inputs(&c, in, n);
+    compute(t, op, &c, n, wants || made, ready);
     dar_val *y = push_val(t, c.y);
     y->wants_grad = wants;
-    if (wants) {
-        dar_node *node = push_meta(t, sizeof *node);
-        void *copy = op->attr_size ? dar_arena_push(&t->meta, op->attr_size) : NULL;
-        if (copy) memcpy(copy, attr, op->attr_size);
-        *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = copy, .aux = c.aux };
-        memcpy(node->in, in, sizeof in);
-        t->last = node;
-    }
+    if (wants) push_node(t, op, &c, in, n, y);
     if (made) *made = (struct kept){ c.y, c.aux };
     return y;
 }
