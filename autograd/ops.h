@@ -29,6 +29,64 @@ dar_val *dar_relu(dar_tape *t, dar_val *x);
 
 /* ---------------------------------------------------------------- convolution and resampling */
 
+/* How a kernel is laid over its input.  Output sizes are floor((padded length - kernel length) / stride) + 1. */
+typedef struct dar_conv_attr {
+    int stride;                   /* in space, both directions */
+    int top, bottom, left, right; /* zero rows and columns around every frame */
+    int stride_t;                 /* conv3d: in time */
+    int front;                    /* conv3d: frames before frame 0 */
+} dar_conv_attr;
+
+/* Stride 1 and as much padding as keeps the size of odd kernels, all of it in front in time (causal).  w: [.., kh, kw]
+ * or [.., kt, kh, kw]. */
+dar_conv_attr dar_conv_same(const dar_val *w);
+
+/* Cross-correlation of every frame, as nn.Conv2d.
+ *
+ *   x  [B, Cin, H, W] or [B, Cin, T, H, W]      w  [Cout, Cin, kh, kw]      b  [Cout] or NULL
+ *   y  [B, Cout, H', W'] or [B, Cout, T, H', W']
+ *
+ *   y[o, h, w] = b[o] + sum over c, i, j of w[o, c, i, j] x[c, h stride + i - top, w stride + j - left] */
+dar_val *dar_conv2d(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, dar_conv_attr a);
+
+/* The same with a kernel over time that looks back.
+ *
+ *   x        [B, Cin, T, H, W]      w  [Cout, Cin, kt, kh, kw]      b  [Cout] or NULL
+ *   history  [B, Cin, P, H, W], P <= front, or NULL: the frames right before x; what is missing of `front` is zero
+ *
+ * Tap k of output frame t reads frame t stride_t + k - front.  A clip cut into chunks, each with the frames before it
+ * as history, gives the same bits as the whole clip.  Source: the causal convolution of the Wan VAE. */
+dar_val *dar_conv3d(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, dar_val *history, dar_conv_attr a);
+
+/* All below take [B, C, H, W], or [B, C, T, H, W] frame by frame. */
+
+/* Where element (c, dy, dx) of an r x r block of pixels, or (c, j) of r frames, stands among the coarse channels. */
+typedef enum dar_pixel_order {
+    DAR_PIXELS_ROWS,    /* (c r + dy) r + dx: torch's pixel_unshuffle */
+    DAR_PIXELS_COLUMNS, /* (c r + dx) r + dy: patchify of the Wan VAE */
+    DAR_FRAMES_FIRST,   /* j C + c: channel groups are frames */
+} dar_pixel_order;
+
+/* y[k(c, dy, dx), h, w] = x[c, r h + dy, r w + dx] and back.  r divides H and W, r r divides the channels. */
+dar_val *dar_pixel_unshuffle(dar_tape *t, dar_val *x, int r, dar_pixel_order order);
+dar_val *dar_pixel_shuffle(dar_tape *t, dar_val *x, int r, dar_pixel_order order);
+
+/* y[j C + c, i] = x[c, r i + j] and back: frames to channel groups, older first. */
+dar_val *dar_frame_unshuffle(dar_tape *t, dar_val *x, int r);
+dar_val *dar_frame_shuffle(dar_tape *t, dar_val *x, int r);
+
+/* Mean of groups: number all (c, a, b, d), a < ft frames, b, d < fs rows and columns, as ((c ft + a) fs + b) fs + d;
+ * output channel o is the mean of the C ft fs fs / channels consecutive numbers from o times that.  If T is no multiple
+ * of ft, zero frames in front complete it.  Source: AvgDown3D of the Wan2.2 VAE. */
+dar_val *dar_avg_down(dar_tape *t, dar_val *x, int64_t channels, int ft, int fs);
+
+/* The reverse: each channel fills its group of the same numbers.  The first `drop` < ft frames are left out: ft - 1 at
+ * the start of a clip, else 0.  Source: DupUp3D of the Wan2.2 VAE. */
+dar_val *dar_dup_up(dar_tape *t, dar_val *x, int64_t channels, int ft, int fs, int drop);
+
+/* y[c, h, w] = x[c, h / r, w / r]. */
+dar_val *dar_upsample_nearest(dar_tape *t, dar_val *x, int r);
+
 /* ---------------------------------------------------------------- shape */
 
 /* The same values in contiguous memory: always a copy. */

@@ -1,0 +1,414 @@
+/* resample.c: exchange of pixels, frames and channels between a fine grid and a coarse one: shuffles, shortcuts and
+ * nearest up-sampling.
+ *
+ * All of them are one relation.  The elements of fine channel c under coarse position (t, h, w) are numbered
+ *
+ *   k = c step_c + a step_a + b step_b + d step_d,      element [c, t ft + a - front, h fs + b, w fs + d]
+ *
+ * for a < ft and b, d < fs, and coarse channel o stands for the G numbers from o G.  Down takes the mean of each group,
+ * up copies the coarse value to its whole group; each is the other's gradient, but for the factor 1/G.  Fine frames
+ * before frame 0, `front` of them, are zero when read and lost when written. */
+#include "autograd/ops.h"
+
+#include <string.h>
+
+#include "lib/kern.h"
+#include "lib/thread.h"
+
+struct attr {
+    int64_t channels; /* of y; 0: as many as make G = 1 */
+    int ft, fs;
+    int front; /* up: fine frames lost; down pads to whole groups by itself */
+    dar_pixel_order order;
+};
+
+/* ---------------------------------------------------------------- rows */
+
+/* take: acc[i] (+)= src[i step].  spread: dst[i step] (+)= scale v[i].  The usual steps are constants, so that they
+ * vectorise. */
+#define DEF_ROW(NAME, TYPE)                                                                                            \
+    static inline __attribute__((always_inline)) void take_step_##NAME(size_t n, const TYPE *src, size_t step,         \
+                                                                       TYPE *acc, bool add)                            \
+    {                                                                                                                  \
+        if (add)                                                                                                       \
+            for (size_t i = 0; i < n; i++) acc[i] = (TYPE)(acc[i] + src[i * step]);                                    \
+        else                                                                                                           \
+            for (size_t i = 0; i < n; i++) acc[i] = src[i * step];                                                     \
+    }                                                                                                                  \
+    static void take_##NAME(size_t n, const void *src, size_t step, void *acc, bool add)                               \
+    {                                                                                                                  \
+        if (step == 1) take_step_##NAME(n, src, 1, acc, add);                                                          \
+        else if (step == 2) take_step_##NAME(n, src, 2, acc, add);                                                     \
+        else take_step_##NAME(n, src, step, acc, add);                                                                 \
+    }                                                                                                                  \
+    static inline __attribute__((always_inline)) void spread_step_##NAME(size_t n, const TYPE *v, TYPE scale,          \
+                                                                         TYPE *dst, size_t step, bool add)             \
+    {                                                                                                                  \
+        if (add)                                                                                                       \
+            for (size_t i = 0; i < n; i++) dst[i * step] = (TYPE)(dst[i * step] + scale * v[i]);                       \
+        else                                                                                                           \
+            for (size_t i = 0; i < n; i++) dst[i * step] = (TYPE)(scale * v[i]);                                       \
+    }                                                                                                                  \
+    static void spread_##NAME(size_t n, const void *v, double scale, void *dst, size_t step, bool add)                 \
+    {                                                                                                                  \
+        if (step == 1) spread_step_##NAME(n, v, (TYPE)scale, dst, 1, add);                                             \
+        else if (step == 2) spread_step_##NAME(n, v, (TYPE)scale, dst, 2, add);                                        \
+        else spread_step_##NAME(n, v, (TYPE)scale, dst, step, add);                                                    \
+    }
+
+DEF_ROW(f64, double)
+DEF_ROW(f32, float)
+DEF_ROW(bits, uint16_t) /* bf16 and f16 are only moved: scale 1, no add */
+
+typedef struct row_fns {
+    void (*take)(size_t n, const void *src, size_t step, void *acc, bool add);
+    void (*spread)(size_t n, const void *v, double scale, void *dst, size_t step, bool add);
+} row_fns;
+
+static const row_fns rows[] = { [DAR_F64] = { take_f64, spread_f64 },
+                                [DAR_F32] = { take_f32, spread_f32 },
+                                [DAR_BF16] = { take_bits, spread_bits },
+                                [DAR_F16] = { take_bits, spread_bits } };
+
+/* ---------------------------------------------------------------- the relation */
+
+struct grid {
+    const dar_tensor *fine, *coarse;
+    size_t Cf, Tf, Hf, Wf, Cc, Tc, Hc, Wc;
+    size_t ft, fs, front, G;
+    size_t step_c, step_a, step_b, step_d;
+    double scale;
+    bool add;
+    dar_dtype work; /* type of sums; the stored one where values are only moved */
+};
+
+struct digits {
+    size_t c, a, b, d;
+};
+
+static struct digits digits_of(const struct grid *g, size_t k)
+{
+    return (struct digits){ k / g->step_c % g->Cf, k / g->step_a % g->ft, k / g->step_b % g->fs,
+                            k / g->step_d % g->fs };
+}
+
+/* [B, C, H, W] is [B, C, 1, H, W]. */
+static void dims(const dar_shape *s, size_t *C, size_t *T, size_t *H, size_t *W)
+{
+    *C = (size_t)s->d[1];
+    *T = s->n == 5 ? (size_t)s->d[2] : 1;
+    *H = (size_t)s->d[s->n - 2];
+    *W = (size_t)s->d[s->n - 1];
+}
+
+static struct grid grid_of(const struct attr *a, const dar_tensor *fine, const dar_tensor *coarse, bool mean, bool add)
+{
+    struct grid g = { .fine = fine, .coarse = coarse, .ft = (size_t)a->ft, .fs = (size_t)a->fs, .add = add };
+    dims(&fine->shape, &g.Cf, &g.Tf, &g.Hf, &g.Wf);
+    dims(&coarse->shape, &g.Cc, &g.Tc, &g.Hc, &g.Wc);
+    g.G = g.Cc ? g.Cf * g.ft * g.fs * g.fs / g.Cc : 1;
+    g.front = g.Tc * g.ft - g.Tf;
+    g.scale = mean ? 1.0 / (double)g.G : 1;
+    g.work = fine->dtype;
+    if (a->order == DAR_PIXELS_ROWS) {
+        g.step_d = 1, g.step_b = g.fs, g.step_a = g.fs * g.fs, g.step_c = g.fs * g.fs * g.ft;
+    } else if (a->order == DAR_PIXELS_COLUMNS) {
+        g.step_b = 1, g.step_d = g.fs, g.step_a = g.fs * g.fs, g.step_c = g.fs * g.fs * g.ft;
+    } else {
+        g.step_c = 1, g.step_d = g.Cf, g.step_b = g.Cf * g.fs, g.step_a = g.Cf * g.fs * g.fs;
+    }
+    return g;
+}
+
+static char *element(const dar_tensor *x, size_t i)
+{
+    return (char *)x->data + i * dar_dtype_size(x->dtype);
+}
+
+/* n coarse elements of row i from column w: the sum of each one's group. */
+static void sum_group(const struct grid *g, size_t i, size_t w, size_t n, void *acc)
+{
+    size_t h = i % g->Hc, t = i / g->Hc % g->Tc, o = i / g->Hc / g->Tc % g->Cc, batch = i / g->Hc / g->Tc / g->Cc;
+    double buf[DAR_PIECE];
+    bool any = false;
+
+    for (size_t k = o * g->G; k < (o + 1) * g->G; k++) {
+        struct digits e = digits_of(g, k);
+        if (t * g->ft + e.a < g->front) continue;
+        size_t frame = t * g->ft + e.a - g->front;
+        size_t row = ((batch * g->Cf + e.c) * g->Tf + frame) * g->Hf + h * g->fs + e.b;
+        size_t length = (n - 1) * g->fs + 1;
+        const void *src = element(g->fine, row * g->Wf + w * g->fs + e.d);
+        if (g->work != g->fine->dtype) src = dar_row_get(g->work, g->fine->dtype, src, length, buf);
+        rows[g->work].take(n, src, g->fs, acc, any);
+        any = true;
+    }
+    if (!any) memset(acc, 0, n * dar_dtype_size(g->work));
+}
+
+static void gather_rows(void *ctx, size_t begin, size_t end, int thread)
+{
+    const struct grid *g = ctx;
+    size_t piece = DAR_PIECE / g->fs;
+    bool direct = g->work == g->coarse->dtype && g->scale == 1 && !g->add;
+    double acc[DAR_PIECE];
+    (void)thread;
+
+    for (size_t i = begin; i < end; i++)
+        for (size_t w = 0; w < g->Wc; w += piece) {
+            size_t n = g->Wc - w < piece ? g->Wc - w : piece;
+            char *to = element(g->coarse, i * g->Wc + w);
+            sum_group(g, i, w, n, direct ? (void *)to : acc);
+            if (direct) continue;
+            if (g->work == g->coarse->dtype) {
+                rows[g->work].spread(n, acc, g->scale, to, 1, g->add);
+            } else {
+                rows[g->work].spread(n, acc, g->scale, acc, 1, false);
+                dar_row_put(g->work, acc, g->coarse->dtype, to, n, g->add);
+            }
+        }
+}
+
+static void spread_rows(void *ctx, size_t begin, size_t end, int thread)
+{
+    const struct grid *g = ctx;
+    (void)thread;
+
+    for (size_t i = begin; i < end; i++) {
+        size_t h = i % g->Hf, f = i / g->Hf % g->Tf + g->front, c = i / g->Hf / g->Tf % g->Cf;
+        size_t batch = i / g->Hf / g->Tf / g->Cf;
+        size_t k = c * g->step_c + f % g->ft * g->step_a + h % g->fs * g->step_b;
+        for (size_t d = 0; d < g->fs; d++) {
+            size_t o = (k + d * g->step_d) / g->G;
+            size_t row = ((batch * g->Cc + o) * g->Tc + f / g->ft) * g->Hc + h / g->fs;
+            rows[g->work].spread(g->Wc, element(g->coarse, row * g->Wc), g->scale, element(g->fine, i * g->Wf + d),
+                                 g->fs, g->add);
+        }
+    }
+}
+
+#define CHUNK 32768 /* elements per task */
+
+static void gather(struct grid *g)
+{
+    size_t n = dar_tensor_rows(g->coarse), chunk = CHUNK / (g->Wc * g->G + 1);
+    if (g->G > 1) g->work = dar_compute_type(g->fine->dtype);
+    dar_parallel_range(n, chunk ? chunk : 1, gather_rows, g);
+}
+
+static void spread(struct grid *g)
+{
+    size_t n = dar_tensor_rows(g->fine), chunk = CHUNK / (g->Wf + 1);
+    dar_parallel_range(n, chunk ? chunk : 1, spread_rows, g);
+}
+
+/* ---------------------------------------------------------------- down */
+
+static void check_common(const char *name, const dar_shape *x, const struct attr *a)
+{
+    char text[96];
+    dar_shape_text(x, text, sizeof text);
+    DAR_ASSERT(x->n == 4 || x->n == 5, "%s: x is %s, expected [B, C, H, W] or [B, C, T, H, W]", name, text);
+    DAR_ASSERT(a->ft >= 1 && a->fs >= 1 && a->fs <= DAR_PIECE && a->channels >= 0, "%s: factors %d, %d, %lld channels",
+               name, a->ft, a->fs, (long long)a->channels);
+    DAR_ASSERT(x->n == 5 || a->ft == 1, "%s: x is %s and has no frames", name, text);
+}
+
+static dar_shape down_shape(const dar_shape *in, int n_in, const void *attr)
+{
+    const struct attr *a = attr;
+    dar_shape y = in[0];
+    char text[96];
+    (void)n_in;
+    check_common("resample_down", in, a);
+    dar_shape_text(in, text, sizeof text);
+    int64_t *H = &y.d[y.n - 2], *W = &y.d[y.n - 1], all = y.d[1] * a->ft * a->fs * a->fs;
+    DAR_ASSERT(*H % a->fs == 0 && *W % a->fs == 0, "resample_down: %s does not divide by %d", text, a->fs);
+    y.d[1] = a->channels ? a->channels : all;
+    DAR_ASSERT(all % y.d[1] == 0, "resample_down: %s by %d x %d x %d makes no %lld equal groups", text, a->ft, a->fs,
+               a->fs, (long long)y.d[1]);
+    if (y.n == 5) y.d[2] = (y.d[2] + a->ft - 1) / a->ft;
+    *H /= a->fs;
+    *W /= a->fs;
+    return y;
+}
+
+static void down_forward(const dar_opctx *c)
+{
+    struct grid g = grid_of(c->attr, &c->x[0], &c->y, true, false);
+    gather(&g);
+}
+
+static void down_backward(const dar_opctx *c)
+{
+    if (!c->gx[0].data) return; /* frozen */
+    struct grid g = grid_of(c->attr, &c->gx[0], &c->gy, true, c->add[0]);
+    spread(&g);
+}
+
+static const struct attr unshuffle_2 = { 0, 1, 2, 0, DAR_PIXELS_ROWS }, unshuffle_3 = { 0, 1, 3, 0, DAR_PIXELS_ROWS };
+static const struct attr patchify = { 0, 1, 2, 0, DAR_PIXELS_COLUMNS };
+static const struct attr frames_2 = { 0, 2, 1, 0, DAR_FRAMES_FIRST }, frames_1 = { 0, 1, 1, 0, DAR_FRAMES_FIRST };
+static const struct attr down_space = { 3, 1, 2, 0, DAR_PIXELS_ROWS }, down_both = { 6, 2, 2, 0, DAR_PIXELS_ROWS };
+static const struct attr down_one = { 3, 1, 1, 0, DAR_PIXELS_ROWS }, down_three = { 2, 3, 1, 0, DAR_PIXELS_ROWS };
+
+static const dar_sample down_samples[] = {
+    { .in = { { 4, { 1, 1, 2, 2 } } }, .attr = &unshuffle_2 },     /* one coarse pixel */
+    { .in = { { 4, { 2, 3, 4, 10 } } }, .attr = &unshuffle_2 },    /* torch's order */
+    { .in = { { 5, { 2, 2, 3, 6, 15 } } }, .attr = &unshuffle_3 }, /* per frame, odd factor */
+    { .in = { { 4, { 2, 3, 4, 10 } } }, .attr = &patchify },       /* columns first */
+    { .in = { { 5, { 1, 3, 2, 4, 6 } } }, .attr = &patchify },     /* per frame */
+    { .in = { { 5, { 2, 3, 4, 2, 5 } } }, .attr = &frames_2 },     /* frames to channels */
+    { .in = { { 5, { 1, 3, 3, 2, 5 } } }, .attr = &frames_2 },     /* half a group in front */
+    { .in = { { 5, { 1, 2, 3, 2, 5 } } }, .attr = &frames_1 },     /* nothing to do */
+    { .in = { { 5, { 1, 3, 2, 4, 6 } } }, .attr = &down_space },   /* plain 2 x 2 mean */
+    { .in = { { 5, { 2, 3, 1, 4, 6 } } }, .attr = &down_both },    /* lone first frame */
+    { .in = { { 5, { 1, 3, 4, 4, 6 } } }, .attr = &down_both },    /* whole groups */
+    { .in = { { 5, { 1, 3, 5, 4, 6 } } }, .attr = &down_both },    /* both */
+    { .in = { { 4, { 2, 3, 2, 5 } } }, .attr = &down_one },        /* identity */
+    { .in = { { 5, { 1, 4, 4, 2, 3 } } }, .attr = &down_three },   /* groups cross channels, two zero frames */
+};
+
+static const dar_error_sample down_errors[] = {
+    { .in = { { 3, { 2, 4, 6 } } }, .attr = &unshuffle_2 },
+    { .in = { { 4, { 1, 2, 4, 5 } } }, .attr = &unshuffle_2 },
+    { .in = { { 4, { 1, 2, 4, 4 } } }, .attr = &down_both },  /* no frames */
+    { .in = { { 4, { 1, 2, 4, 4 } } }, .attr = &down_space }, /* 8 into 3 groups */
+};
+
+const dar_op dar_op_resample_down = {
+    .name = "resample_down",
+    .n_in = 1,
+    .attr_size = sizeof(struct attr),
+    .shape = down_shape,
+    .forward = down_forward,
+    .backward = down_backward,
+    .samples = down_samples,
+    .n_samples = DAR_COUNT(down_samples),
+    .errors = down_errors,
+    .n_errors = DAR_COUNT(down_errors),
+};
+
+/* ---------------------------------------------------------------- up */
+
+static dar_shape up_shape(const dar_shape *in, int n_in, const void *attr)
+{
+    const struct attr *a = attr;
+    dar_shape y = in[0];
+    char text[96];
+    (void)n_in;
+    check_common("resample_up", in, a);
+    dar_shape_text(in, text, sizeof text);
+    int64_t block = (int64_t)a->ft * a->fs * a->fs;
+    if (!a->channels)
+        DAR_ASSERT(y.d[1] % block == 0, "resample_up: %s: channels do not divide by %lld", text, (long long)block);
+    int64_t channels = a->channels ? a->channels : y.d[1] / block;
+    DAR_ASSERT(y.d[1] > 0 && channels * block % y.d[1] == 0, "resample_up: %s to %lld channels by %d x %d x %d", text,
+               (long long)channels, a->ft, a->fs, a->fs);
+    y.d[1] = channels;
+    DAR_ASSERT(a->front >= 0 && a->front < a->ft, "resample_up: drops %d of each %d frames", a->front, a->ft);
+    if (y.n == 5) y.d[2] = y.d[2] ? y.d[2] * a->ft - a->front : 0;
+    y.d[y.n - 2] *= a->fs;
+    y.d[y.n - 1] *= a->fs;
+    return y;
+}
+
+static void up_forward(const dar_opctx *c)
+{
+    struct grid g = grid_of(c->attr, &c->y, &c->x[0], false, false);
+    spread(&g);
+}
+
+static void up_backward(const dar_opctx *c)
+{
+    if (!c->gx[0].data) return; /* frozen */
+    struct grid g = grid_of(c->attr, &c->gy, &c->gx[0], false, c->add[0]);
+    gather(&g);
+}
+
+static const struct attr nearest_2 = { 3, 1, 2, 0, DAR_PIXELS_ROWS }, nearest_3 = { 2, 1, 3, 0, DAR_PIXELS_ROWS };
+static const struct attr up_both = { 2, 2, 2, 0, DAR_PIXELS_ROWS }, up_first = { 2, 2, 2, 1, DAR_PIXELS_ROWS };
+static const struct attr up_halve = { 2, 1, 2, 0, DAR_PIXELS_ROWS };
+
+static const dar_sample up_samples[] = {
+    { .in = { { 4, { 1, 4, 1, 1 } } }, .attr = &unshuffle_2 },     /* one coarse pixel */
+    { .in = { { 4, { 2, 12, 2, 5 } } }, .attr = &unshuffle_2 },    /* torch's order */
+    { .in = { { 5, { 1, 18, 2, 2, 3 } } }, .attr = &unshuffle_3 }, /* per frame, odd factor */
+    { .in = { { 4, { 2, 12, 2, 5 } } }, .attr = &patchify },       /* columns first */
+    { .in = { { 5, { 1, 4, 3, 2, 3 } } }, .attr = &patchify },     /* per frame */
+    { .in = { { 5, { 2, 6, 2, 2, 5 } } }, .attr = &frames_2 },     /* channels to frames */
+    { .in = { { 4, { 2, 3, 2, 5 } } }, .attr = &nearest_2 },       /* nearest */
+    { .in = { { 5, { 1, 2, 2, 3, 5 } } }, .attr = &nearest_3 },    /* per frame, odd factor */
+    { .in = { { 5, { 2, 2, 3, 2, 3 } } }, .attr = &up_both },      /* duplicate in time and space */
+    { .in = { { 5, { 1, 2, 3, 2, 3 } } }, .attr = &up_first },     /* first frame lost */
+    { .in = { { 5, { 1, 4, 1, 2, 3 } } }, .attr = &up_first },     /* lone first frame */
+    { .in = { { 5, { 1, 4, 2, 2, 3 } } }, .attr = &up_halve },     /* row parity picks the channel */
+};
+
+static const struct attr up_bad_front = { 2, 2, 1, 2, DAR_PIXELS_ROWS };
+static const dar_error_sample up_errors[] = {
+    { .in = { { 3, { 4, 4, 6 } } }, .attr = &unshuffle_2 },
+    { .in = { { 4, { 1, 6, 4, 5 } } }, .attr = &unshuffle_2 },
+    { .in = { { 4, { 1, 2, 4, 4 } } }, .attr = &up_both },    /* no frames */
+    { .in = { { 5, { 1, 3, 1, 4, 4 } } }, .attr = &up_both }, /* 16 copies of 3 channels */
+    { .in = { { 5, { 1, 2, 1, 4, 4 } } }, .attr = &up_bad_front },
+};
+
+const dar_op dar_op_resample_up = {
+    .name = "resample_up",
+    .n_in = 1,
+    .attr_size = sizeof(struct attr),
+    .shape = up_shape,
+    .forward = up_forward,
+    .backward = up_backward,
+    .samples = up_samples,
+    .n_samples = DAR_COUNT(up_samples),
+    .errors = up_errors,
+    .n_errors = DAR_COUNT(up_errors),
+};
+
+/* ---------------------------------------------------------------- by name */
+
+dar_val *dar_pixel_unshuffle(dar_tape *t, dar_val *x, int r, dar_pixel_order order)
+{
+    struct attr a = { .ft = 1, .fs = r, .order = order };
+    return dar_apply(t, &dar_op_resample_down, &x, 1, &a);
+}
+
+dar_val *dar_pixel_shuffle(dar_tape *t, dar_val *x, int r, dar_pixel_order order)
+{
+    struct attr a = { .ft = 1, .fs = r, .order = order };
+    return dar_apply(t, &dar_op_resample_up, &x, 1, &a);
+}
+
+dar_val *dar_frame_unshuffle(dar_tape *t, dar_val *x, int r)
+{
+    struct attr a = { .ft = r, .fs = 1, .order = DAR_FRAMES_FIRST };
+    DAR_ASSERT(x->x.shape.n == 5 && r > 0 && x->x.shape.d[2] % r == 0, "frame_unshuffle: frames do not divide by %d",
+               r);
+    return dar_apply(t, &dar_op_resample_down, &x, 1, &a);
+}
+
+dar_val *dar_frame_shuffle(dar_tape *t, dar_val *x, int r)
+{
+    struct attr a = { .ft = r, .fs = 1, .order = DAR_FRAMES_FIRST };
+    return dar_apply(t, &dar_op_resample_up, &x, 1, &a);
+}
+
+dar_val *dar_avg_down(dar_tape *t, dar_val *x, int64_t channels, int ft, int fs)
+{
+    struct attr a = { .channels = channels, .ft = ft, .fs = fs };
+    return dar_apply(t, &dar_op_resample_down, &x, 1, &a);
+}
+
+dar_val *dar_dup_up(dar_tape *t, dar_val *x, int64_t channels, int ft, int fs, int drop)
+{
+    struct attr a = { .channels = channels, .ft = ft, .fs = fs, .front = drop };
+    return dar_apply(t, &dar_op_resample_up, &x, 1, &a);
+}
+
+dar_val *dar_upsample_nearest(dar_tape *t, dar_val *x, int r)
+{
+    DAR_ASSERT(x->x.shape.n >= 2, "upsample_nearest: x has %d dimensions", x->x.shape.n);
+    return dar_dup_up(t, x, x->x.shape.d[1], 1, r, 0);
+}
