@@ -170,6 +170,7 @@ static void check_level(const struct shape_of_conv *s, const struct values *v, c
     compare(s->name, "gw", &w->g, &v->gw, &size->gw, u * (P + 8) + half);
     compare(s->name, "gb", &b->g, &v->gb, &size->gb, u * (P + 8));
     compare(s->name, "ghistory", &history->g, &v->ghistory, &size->ghistory, u * (taps * (double)s->Cout + 8) + half);
+    dar_tape_clear(&tape);
     dar_arena_reset(&arena, m);
 }
 

@@ -100,6 +100,16 @@ static double flops(const dar_opctx *c, bool backward)
     return one * ((c->gx[X].data || c->gx[HISTORY].data) + (c->gx[WEIGHT].data != NULL));
 }
 
+static double terms(const dar_shape *in, int n_in, const void *attr, int of)
+{
+    dar_conv g = geometry(in, attr);
+    double taps = (double)(g.kt * g.kh * g.kw);
+    (void)n_in;
+    if (of < 0) return taps * (double)g.Cin;
+    if (of == X || of == HISTORY) return taps * (double)g.Cout;
+    return (double)g.B * (double)g.To * (double)(g.Ho * g.Wo);
+}
+
 static void forward(const dar_opctx *c)
 {
     dar_conv g = geometry_of(c);
@@ -165,6 +175,7 @@ const dar_op dar_op_conv2d = {
     .attr_size = sizeof(dar_conv_attr),
     .shape = conv2d_shape,
     .scratch = scratch,
+    .terms = terms,
     .flops = flops,
     .forward = forward,
     .backward = backward,
@@ -240,6 +251,7 @@ const dar_op dar_op_conv3d = {
     .attr_size = sizeof(dar_conv_attr),
     .shape = conv3d_shape,
     .scratch = scratch,
+    .terms = terms,
     .flops = flops,
     .forward = forward,
     .backward = backward,

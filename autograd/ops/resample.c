@@ -233,6 +233,13 @@ static dar_shape down_shape(const dar_shape *in, int n_in, const void *attr)
     return y;
 }
 
+static double down_terms(const dar_shape *in, int n_in, const void *attr, int of)
+{
+    const struct attr *a = attr;
+    (void)n_in;
+    return of < 0 && a->channels ? (double)(in[0].d[1] * a->ft * a->fs * a->fs / a->channels) : 1;
+}
+
 static void down_forward(const dar_opctx *c)
 {
     struct grid g = grid_of(c->attr, &c->x[0], &c->y, true, false);
@@ -281,6 +288,7 @@ const dar_op dar_op_resample_down = {
     .n_in = 1,
     .attr_size = sizeof(struct attr),
     .shape = down_shape,
+    .terms = down_terms,
     .forward = down_forward,
     .backward = down_backward,
     .samples = down_samples,
@@ -311,6 +319,13 @@ static dar_shape up_shape(const dar_shape *in, int n_in, const void *attr)
     y.d[y.n - 2] *= a->fs;
     y.d[y.n - 1] *= a->fs;
     return y;
+}
+
+static double up_terms(const dar_shape *in, int n_in, const void *attr, int of)
+{
+    const struct attr *a = attr;
+    (void)n_in;
+    return of == 0 && a->channels ? (double)(a->channels * a->ft * a->fs * a->fs / in[0].d[1]) : 1;
 }
 
 static void up_forward(const dar_opctx *c)
@@ -359,6 +374,7 @@ const dar_op dar_op_resample_up = {
     .n_in = 1,
     .attr_size = sizeof(struct attr),
     .shape = up_shape,
+    .terms = up_terms,
     .forward = up_forward,
     .backward = up_backward,
     .samples = up_samples,
