@@ -27,6 +27,25 @@ dar_val *dar_relu(dar_tape *t, dar_val *x);
 
 /* ---------------------------------------------------------------- attention */
 
+/* Variations of attention. */
+typedef struct dar_attention_opt {
+    int64_t heads;
+    double scale;        /* 0: 1 / sqrt(E) */
+    dar_val *log_weight; /* [Nk] or [B, Nk], f32 or f64, frozen: added to the logits of each key; NULL: none */
+    bool keep;           /* in a recompute segment: keep the result (dar_apply_kept) */
+} dar_attention_opt;
+
+/* Attention over D = heads E columns, head by head.
+ *
+ *   q     [B, Nq, D]
+ *   k, v  [B, Nk, D]   f64 if q is, else any
+ *   y     [B, Nq, D]   l_ij = scale q_i . k_j + lw_j; y_i = sum_j softmax(l_i)_j v_j
+ *
+ * One key with lw = log n stands for n equal ones; lw = -inf masks a key; a row without any key gives zeros and zero
+ * gradients.  bf16 q, k, v multiply as bf16, sums and exponentials are f32.  Saves two numbers per head and row.
+ * Source: Vaswani et al. 2017, eq. 1; algorithm in lib/attn.h. */
+dar_val *dar_attention(dar_tape *t, dar_val *q, dar_val *k, dar_val *v, const dar_attention_opt *o);
+
 /* ---------------------------------------------------------------- convolution and resampling */
 
 /* How a kernel is laid over its input.  Output sizes are floor((padded length - kernel length) / stride) + 1. */

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "lib/kern.h"
+#include "lib/kern_attn.h"
 #include "lib/tile.h"
 
 static unsigned in_force;
@@ -38,6 +39,7 @@ static void fill(unsigned flags)
     in_force = close_down(flags & dar_cpu_detect());
     dar_kern_init(in_force);
     dar_tile_init(in_force);
+    dar_kern_attn_init(in_force);
 }
 
 static void fill_all(void)

@@ -1,0 +1,23 @@
+/* kern_attn.c: filling the table of attention kernels. */
+#include "lib/kern_attn.h"
+
+#include "lib/cpu.h"
+#include "lib/status.h"
+
+static dar_kern_attn table[DAR_TILE_KINDS];
+
+void dar_kern_attn_init(unsigned cpu_flags)
+{
+    (void)cpu_flags;
+    dar_kern_attn_ref_f64(&table[DAR_TILE_F64]);
+    dar_kern_attn_ref_f32(&table[DAR_TILE_F32]);
+    dar_kern_attn_ref_bf16(&table[DAR_TILE_BF16]);
+}
+
+const dar_kern_attn *dar_kern_attn_for(dar_tile_kind kind)
+{
+    dar_cpu_flags(); /* fills the tables at first use */
+    DAR_ASSERT(kind == DAR_TILE_F64 || kind == DAR_TILE_F32 || kind == DAR_TILE_BF16,
+               "attention: no weights for tile kind %d", (int)kind);
+    return &table[kind];
+}
