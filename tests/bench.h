@@ -70,7 +70,7 @@ struct bench {
     void *state; /* of the kind */
 };
 
-/* The processor that OpenBLAS takes this one for; OPENBLAS_CORETYPE chooses another. */
+/* The processor that OpenBLAS takes this one for. */
 const char *bench_blas_core(void);
 
 /* The tables. */

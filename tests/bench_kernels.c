@@ -11,7 +11,6 @@
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
-#include <unistd.h>
 
 #include "lib/cpu.h"
 #include "lib/kern.h"
@@ -342,15 +341,6 @@ static void report_peaks(int threads_all)
     }
 }
 
-/* OpenBLAS looks at its environment before main runs, and takes processors newer than itself for old ones: a Zen 5 for
- * a Haswell, at half the speed.  The yardstick gets the AVX-512 kernels where the processor has the instructions. */
-static void start_with_best_blas(char **argv)
-{
-    static const char name[] = "OPENBLAS_CORETYPE";
-    if (getenv(name) || !(dar_cpu_detect() & DAR_CPU_AVX512) || setenv(name, "SkylakeX", 0) != 0) return;
-    execv("/proc/self/exe", argv); /* comes back only if it cannot */
-}
-
 int main(int argc, char **argv)
 {
     static const struct {
@@ -368,7 +358,6 @@ int main(int argc, char **argv)
     dar_err e;
     double begin = now();
 
-    start_with_best_blas(argv);
     for (int i = 2; i < argc; i++) {
         if (strcmp(argv[i], "quick") == 0) o = &quick;
         else if (strncmp(argv[i], "filter=", 7) == 0) filter = argv[i] + 7;

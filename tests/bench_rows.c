@@ -1,8 +1,9 @@
-/* bench_rows.c: rows of kernels that no op stands for: copies, conversions. */
+/* bench_rows.c: rows of kernels that no op stands for: conversions, scans, 8-bit rows, the optimiser. */
 #include "tests/bench.h"
 
 #include "lib/kern.h"
 #include "lib/status.h"
+#include "lib/thread.h"
 
 /* ---------------------------------------------------------------- conversions */
 
@@ -31,13 +32,89 @@ static void run_copy(bench *b)
 static const bench_kind from_f32 = { .part = { "convert_from_f32" }, .setup = setup_from_f32, .run = { run_copy } };
 static const bench_kind to_f32 = { .part = { "convert_to_f32" }, .setup = setup_to_f32, .run = { run_copy } };
 
+/* ---------------------------------------------------------------- scans */
+
+static void setup_scan(bench *b)
+{
+    b->x[0] = bench_tensor(b, b->row->type, DAR_SHAPE(b->s[0], b->s[1]));
+    b->bytes[0] = (double)dar_tensor_bytes(&b->x[0]);
+}
+
+static void run_nonfinite(bench *b)
+{
+    DAR_ASSERT(dar_tensor_nonfinite(&b->x[0]) < 0, "nonfinite: found one");
+}
+
+static const bench_kind nonfinite = { .part = { "nonfinite" }, .setup = setup_scan, .run = { run_nonfinite } };
+
+/* ---------------------------------------------------------------- 8-bit rows */
+
+static void setup_quantise(bench *b)
+{
+    b->x[0] = bench_tensor(b, b->row->type, DAR_SHAPE(b->s[0], b->s[1]));
+    b->y = bench_tensor(b, DAR_I8, DAR_SHAPE(b->s[0], b->s[1]));
+    b->bytes[0] = (double)(dar_tensor_bytes(&b->x[0]) + dar_tensor_bytes(&b->y));
+}
+
+static void quantise_rows(void *ctx, size_t begin, size_t end, int thread)
+{
+    bench *b = ctx;
+    size_t n = (size_t)b->s[1], size = dar_dtype_size(b->x[0].dtype);
+    (void)thread;
+    for (size_t i = begin; i < end; i++)
+        b->y.scale[i] =
+            dar_row_quantise(b->x[0].dtype, (const char *)b->x[0].data + i * n * size, n, (int8_t *)b->y.data + i * n);
+}
+
+static void run_quantise(bench *b)
+{
+    dar_parallel_range((size_t)b->s[0], 16, quantise_rows, b);
+}
+
+static const bench_kind quantise = { .part = { "quantise" }, .setup = setup_quantise, .run = { run_quantise } };
+
+/* ---------------------------------------------------------------- optimiser */
+
+static void setup_adamw(bench *b)
+{
+    for (int i = 0; i < 4; i++) b->x[i] = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[1])); /* w, m, v, g */
+    float *v = b->x[2].data;
+    for (size_t i = 0; i < dar_tensor_count(&b->x[2]); i++) v[i] *= v[i];
+    b->bytes[0] = 7.0 * (double)dar_tensor_bytes(&b->x[0]); /* g is only read */
+}
+
+static void adamw_piece(void *ctx, size_t begin, size_t end, int thread)
+{
+    bench *b = ctx;
+    float *w = b->x[0].data, *m = b->x[1].data, *v = b->x[2].data, *g = b->x[3].data;
+    dar_adamw a = {
+        .rate = 1e-4, .beta1 = 0.9, .beta2 = 0.999, .eps = 1e-8, .decay = 0.01, .fix1 = 1.5, .fix2 = 20, .scale = 1
+    };
+    (void)thread;
+    dar_kern_for(DAR_F32)->adamw(end - begin, &a, w + begin, m + begin, v + begin, g + begin);
+}
+
+static void run_adamw(bench *b)
+{
+    dar_parallel_range(dar_tensor_count(&b->x[0]), 16384, adamw_piece, b);
+}
+
+static const bench_kind adamw = { .part = { "adamw" }, .setup = setup_adamw, .run = { run_adamw } };
+
 /* ---------------------------------------------------------------- rows */
 
 #define MEMORY BENCH_COPY, { 0.8 }, false
 
 const bench_row bench_row_rows[] = {
-    { &from_f32, DAR_F32, { 8192, 3072 }, MEMORY }, { &from_f32, DAR_BF16, { 8192, 3072 }, MEMORY },
-    { &from_f32, DAR_F16, { 8192, 3072 }, MEMORY }, { &to_f32, DAR_BF16, { 8192, 3072 }, MEMORY },
+    { &from_f32, DAR_F32, { 8192, 3072 }, MEMORY },
+    { &from_f32, DAR_BF16, { 8192, 3072 }, MEMORY },
+    { &from_f32, DAR_F16, { 8192, 3072 }, MEMORY },
+    { &to_f32, DAR_BF16, { 8192, 3072 }, MEMORY },
     { &to_f32, DAR_F16, { 8192, 3072 }, MEMORY },
+    { &quantise, DAR_F32, { 8192, 3072 }, MEMORY },
+    { &quantise, DAR_BF16, { 8192, 3072 }, MEMORY },
+    { &nonfinite, DAR_F32, { 8192, 3072 }, BENCH_READ, { 0.8 }, false },
+    { &nonfinite, DAR_BF16, { 8192, 3072 }, BENCH_READ, { 0.8 }, false },
+    { &adamw, DAR_F32, { 8192, 3072 }, MEMORY },
 };
 const size_t bench_n_row_rows = DAR_COUNT(bench_row_rows);
