@@ -67,9 +67,65 @@ static const bench_kind transpose = { .part = { "transpose" },
                                       .inputs = one,
                                       .call = call_transpose };
 
+/* ---------------------------------------------------------------- attention: tokens, heads, head size */
+
+static void queries_keys_values(bench *b)
+{
+    for (int i = 0; i < 3; i++) bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1] * b->s[2]), true);
+}
+
+static dar_val *call_attention(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    return dar_attention(t, x[0], x[1], x[2], &(dar_attention_opt){ .heads = s[1] });
+}
+
+static const bench_kind attention = { BENCH_OP(attention), .inputs = queries_keys_values, .call = call_attention };
+
+/* ---------------------------------------------------------------- convolution: Cin, Cout, T, H, W of a 3x3(x3) kernel
+ */
+
+static void frames(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[2], b->s[3], b->s[4]), true);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1], b->s[0], 3, 3), true);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1]), true);
+}
+
+static void clip(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[2], b->s[3], b->s[4]), true);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1], b->s[0], 3, 3, 3), true);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1]), true);
+}
+
+static dar_val *call_conv2d(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_conv2d(t, x[0], x[1], x[2], dar_conv_same(x[1]));
+}
+
+static dar_val *call_conv3d(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_conv3d(t, x[0], x[1], x[2], NULL, dar_conv_same(x[1]));
+}
+
+static const bench_kind conv2d = { BENCH_OP(conv2d), .inputs = frames, .call = call_conv2d };
+static const bench_kind conv3d = { BENCH_OP(conv3d), .inputs = clip, .call = call_conv3d };
+
 /* ---------------------------------------------------------------- rows */
 
 #define MEMORY BENCH_COPY, { 0.8, 0.8 }, false
+#define ATTN(...)                                                                                                      \
+    { &attention, DAR_F32, { __VA_ARGS__ }, BENCH_F32, { 0.80, 0.68 }, false },                                        \
+    {                                                                                                                  \
+        &attention, DAR_BF16, { __VA_ARGS__ }, BENCH_BF16, { 0.80, 0.68 }, false                                       \
+    }
+#define CONV(kind, ...)                                                                                                \
+    { &kind, DAR_F32, { __VA_ARGS__ }, BENCH_F32, { 0.70, 0.70 }, false },                                             \
+    {                                                                                                                  \
+        &kind, DAR_BF16, { __VA_ARGS__ }, BENCH_BF16, { 0.70, 0.70 }, false                                            \
+    }
 
 /* Larger than the caches, in the two types that networks use. */
 #define STREAM(kind, ...)                                                                                              \
@@ -79,7 +135,22 @@ static const bench_kind transpose = { .part = { "transpose" },
     }
 
 const bench_row bench_op_rows[] = {
-    STREAM(silu, 8192, 3072),       STREAM(gelu_tanh, 8192, 3072), STREAM(relu, 8192, 3072),
-    STREAM(permute, 8192, 24, 128), STREAM(transpose, 8192, 3072),
+    ATTN(1536, 6, 64),
+    ATTN(2048, 24, 128),
+    ATTN(8192, 24, 128),
+
+    CONV(conv2d, 384, 384, 5, 8, 14),    /* adapter, small model */
+    CONV(conv2d, 3072, 3072, 1, 16, 28), /* adapter */
+    CONV(conv2d, 1024, 1024, 1, 32, 56), /* VAE decoder, up-sampling */
+    CONV(conv3d, 48, 1024, 4, 16, 28),   /* VAE decoder, first */
+    CONV(conv3d, 1024, 1024, 2, 16, 28), /* VAE decoder, middle */
+    CONV(conv3d, 256, 256, 1, 128, 224), /* VAE decoder, last stage */
+    CONV(conv3d, 160, 160, 4, 64, 112),  /* VAE encoder, first stage */
+
+    STREAM(silu, 8192, 3072),
+    STREAM(gelu_tanh, 8192, 3072),
+    STREAM(relu, 8192, 3072),
+    STREAM(permute, 8192, 24, 128),
+    STREAM(transpose, 8192, 3072),
 };
 const size_t bench_n_op_rows = DAR_COUNT(bench_op_rows);
