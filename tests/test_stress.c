@@ -34,6 +34,14 @@ static dar_val *leaf(dar_shape s, const float *values, bool g)
     return dar_leaf(&tape, x, g ? &gx : NULL);
 }
 
+/* Backward from ones. */
+static void sweep(dar_val *y)
+{
+    dar_tensor seed = dar_tensor_push(&arena, dar_compute_type(y->x.dtype), y->x.shape);
+    dar_tensor_fill(&seed, 1);
+    dar_backward(&tape, y, &seed);
+}
+
 static double at(const dar_tensor *x, size_t i)
 {
     return dar_dtype_get(x->dtype, x->data, i);
@@ -162,6 +170,203 @@ static void bad_numbers_are_named(void **state)
     CHECK(tape.bad_op && strcmp(tape.bad_op, "silu") == 0 && tape.bad_backward && tape.bad_index == 1,
           "overflow in backward: reported %s at %lld", tape.bad_op ? tape.bad_op : "nothing",
           (long long)tape.bad_index);
+}
+
+/* ---------------------------------------------------------------- softmax, inside attention */
+
+/* Attention of one head of size E over given keys and values, gradient of ones.  Leaves: x[0] q, x[1] k, x[2] v. */
+static dar_val *attend(dar_val *x[3], int64_t queries, int64_t keys, int64_t E, const float *q, const float *k,
+                       const float *v, const float *log_weight)
+{
+    dar_val *lw = log_weight ? leaf(DAR_SHAPE(keys), log_weight, false) : NULL;
+    x[0] = leaf(DAR_SHAPE(1, queries, E), q, true);
+    x[1] = leaf(DAR_SHAPE(1, keys, E), k, true);
+    x[2] = leaf(DAR_SHAPE(1, keys, E), v, true);
+    dar_val *y =
+        dar_attention(&tape, x[0], x[1], x[2], &(dar_attention_opt){ .heads = 1, .scale = 1, .log_weight = lw });
+    sweep(y);
+    return y;
+}
+
+static void check_all(const char *what, const dar_tensor *x, double expected, double bound)
+{
+    for (size_t i = 0; i < dar_tensor_count(x); i++) CHECK_NEAR(what, at(x, i), expected, bound);
+}
+
+/* Logits of +-1e4: the two largest share everything, the others get nothing. */
+static void logits_of_ten_thousand(void **state)
+{
+    (void)state;
+    enum { K = 37 };
+    float q[2] = { 100, 0 }, k[K][2] = { { 0 } }, v[K][2];
+    for (int j = 0; j < K; j++) {
+        k[j][0] = j % 2 ? -100 : 99;
+        v[j][0] = v[j][1] = (float)j;
+    }
+    k[4][0] = k[20][0] = 100; /* 1e4 against 9.9e3 and -1e4 */
+    dar_val *x[3], *y = attend(x, 1, K, 2, q, k[0], v[0], NULL);
+    check_all("mean of the two", &y->x, 12, 0);
+    for (int j = 0; j < K; j++)
+        CHECK_NEAR("weight", at(&x[2]->g, (size_t)(2 * j)), j == 4 || j == 20 ? 0.5 : 0, 1e-43); /* exp(-100) */
+    /* l_4 = l_20 = l: gradient of q is sum_j p_j (v_j - y) k_j = 100 (0.5 (4 - 12) + 0.5 (20 - 12)) 2 = 0 */
+    check_all("gradient of q", &x[0]->g, 0, 1e-3);
+    for (int j = 0; j < K; j++)
+        CHECK_NEAR("gradient of k", at(&x[1]->g, (size_t)(2 * j)), j == 4 ? -800 : j == 20 ? 800 : 0, 1e-3);
+}
+
+/* Without any key there is nothing to attend to: zeros, and nobody learns from it. */
+static void masked_rows_are_zero(void **state)
+{
+    (void)state;
+    enum { K = 67, E = 8 };
+    float q[5 * E], k[K * E], v[K * E], lw[K];
+    for (int i = 0; i < 5 * E; i++) q[i] = sinf((float)i);
+    for (int i = 0; i < K * E; i++) k[i] = 3 * sinf((float)(i + 100)), v[i] = cosf((float)i);
+    for (int j = 0; j < K; j++) lw[j] = -INFINITY;
+    dar_val *x[3], *y = attend(x, 5, K, E, q, k, v, lw);
+    check_all("masked row", &y->x, 0, 0);
+    for (int i = 0; i < 3; i++) check_all("gradient of a masked row", &x[i]->g, 0, 0);
+
+    /* All keys but one: its value, whatever the logit. */
+    lw[40] = -3;
+    y = attend(x, 5, K, E, q, k, v, lw);
+    for (size_t i = 0; i < 5 * E; i++) CHECK_NEAR("the one key", at(&y->x, i), v[40 * E + (int)(i % E)], 0);
+    check_all("gradient of q", &x[0]->g, 0, 1e-5);
+    for (size_t i = 0; i < K * E; i++)
+        CHECK_NEAR("gradient of v", at(&x[2]->g, i), i / E == 40 ? 5 : 0, 0); /* five queries */
+}
+
+/* Padding of a prompt: equal keys, one by one or folded into one with log n. */
+static void equal_keys_fold(void **state)
+{
+    (void)state;
+    enum { SAME = 512, OTHER = 3, K = SAME + OTHER, E = 16 };
+    float q[7 * E], k[K * E], v[K * E], lw[1 + OTHER] = { logf(SAME) };
+    for (int i = 0; i < 7 * E; i++) q[i] = sinf((float)i);
+    for (int i = 0; i < K * E; i++) k[i] = cosf((float)i), v[i] = sinf((float)(3 * i));
+    for (int j = 1; j < SAME; j++) {
+        memcpy(k + j * E, k, E * sizeof *k);
+        memcpy(v + j * E, v, E * sizeof *v);
+    }
+    dar_val *x[3], *z[3];
+    dar_val *y = attend(x, 7, K, E, q, k, v, NULL);
+    dar_val *folded = attend(z, 7, 1 + OTHER, E, q, k + (SAME - 1) * E, v + (SAME - 1) * E, lw);
+    /* (K + 8) roundings of the sum and as many of log n: |v| <= 1 */
+    double bound = (K + 8) * 0x1p-24;
+    for (size_t i = 0; i < 7 * E; i++) CHECK_NEAR("folded", at(&folded->x, i), at(&y->x, i), bound);
+    for (size_t i = 0; i < 7 * E; i++)
+        CHECK_NEAR("gradient of q, folded", at(&z[0]->g, i), at(&x[0]->g, i), 2 * E * bound);
+
+    y = attend(x, 7, SAME, E, q, k, v, NULL);
+    for (size_t i = 0; i < 7 * E; i++) CHECK_NEAR("512 equal keys", at(&y->x, i), v[i % E], bound);
+    y = attend(x, 7, 1, E, q, k, v, NULL);
+    for (size_t i = 0; i < 7 * E; i++) CHECK_NEAR("one key", at(&y->x, i), v[i % E], 0);
+    check_all("gradient of q, one key", &x[0]->g, 0, 1e-5);
+}
+
+/* ---------------------------------------------------------------- tails of activations */
+
+struct activation {
+    const char *name;
+    dar_val *(*op)(dar_tape *t, dar_val *x);
+    bool cubic; /* inner argument 2 sqrt(2/pi) (x + 0.044715 x^3), else x */
+};
+
+/* Both are x s(z), s the logistic function: the form that neither cancels nor overflows. */
+static void exact(const struct activation *a, double x, double *y, double *slope, double *unit, double *unit_slope)
+{
+    double c = 2 * sqrt(2 / M_PI), z = a->cubic ? c * (x + 0.044715 * x * x * x) : x;
+    double dz = a->cubic ? c * (1 + 3 * 0.044715 * x * x) : 1;
+    double s = z < 0 ? exp(z) / (1 + exp(z)) : 1 / (1 + exp(-z)),
+           rest = z < 0 ? 1 / (1 + exp(z)) : exp(-z) / (1 + exp(-z));
+    double inner = isfinite(x) && s * rest > 0 ? x * dz * s * rest : 0;
+    *y = s > 0 ? x * s : 0;
+    *slope = s + inner;
+    /* z in f32 is off by 2 |z| 2^-24, and so are exp(z) and what is made of it in relative size; a logistic function
+     * below the normal numbers is off by 2^-149. */
+    double relative = (2 * fabs(z) + 8) * 0x1p-24, least = 0x1p-148 * (1 + fabs(x) * (1 + fabs(dz)));
+    *unit = relative * fabs(*y) + least;
+    *unit_slope = relative * (s + fabs(inner)) + (isfinite(least) ? least : 0);
+}
+
+static void tails_stay_relative(void **state)
+{
+    (void)state;
+    static const struct activation activations[] = { { "silu", dar_silu, false }, { "gelu", dar_gelu_tanh, true } };
+    static const float far[] = { 89, 104, 500, 1e4f, 1e13f, 1e30f, 3e38f };
+    enum { N = 2 * 60 * 64, FAR = 2 * DAR_COUNT(far) };
+    static float x[N + FAR];
+
+    for (int i = 0; i < N; i++) x[i] = (float)(i - N / 2) / 64;
+    for (int i = 0; i < FAR; i++) x[N + i] = i % 2 ? -far[i / 2] : far[i / 2];
+    for (size_t k = 0; k < DAR_COUNT(activations); k++) {
+        const struct activation *a = &activations[k];
+        setup(NULL);
+        dar_val *in = leaf(DAR_SHAPE(N + FAR), x, true), *out = a->op(&tape, in);
+        sweep(out);
+        for (size_t i = 0; i < N + FAR; i++) {
+            double y, slope, unit, unit_slope;
+            char what[64];
+            exact(a, x[i], &y, &slope, &unit, &unit_slope);
+            snprintf(what, sizeof what, "%s(%g)", a->name, x[i]);
+            CHECK_NEAR(what, at(&out->x, i), y, unit);
+            snprintf(what, sizeof what, "slope of %s at %g", a->name, x[i]);
+            CHECK_NEAR(what, at(&in->g, i), slope, unit_slope);
+        }
+        float ends[2] = { INFINITY, -INFINITY };
+        dar_val *limit = a->op(&tape, leaf(DAR_SHAPE(2), ends, false));
+        CHECK(at(&limit->x, 0) == INFINITY && at(&limit->x, 1) == 0, "%s: limits %g and %g", a->name, at(&limit->x, 0),
+              at(&limit->x, 1));
+    }
+}
+
+/* ---------------------------------------------------------------- the optimiser */
+
+static const dar_adamw adamw_first = { .rate = 1e-3,
+                                       .beta1 = 0.9,
+                                       .beta2 = 0.999,
+                                       .eps = 1e-8,
+                                       .decay = 0.1,
+                                       .fix1 = 1 / (1 - 0.9),
+                                       .fix2 = 1 / (1 - 0.999),
+                                       .scale = 1 };
+
+static void adamw_corners(void **state)
+{
+    (void)state;
+    unsigned level[5], all = dar_cpu_flags();
+    int levels = test_levels(level);
+    /* gradient, and what the first step should do to a weight of 1 beyond its decay */
+    static const struct {
+        float g;
+        double step, bound;
+    } corner[] = {
+        { 0, 0, 0 },                /* only decay */
+        { 1, -1e-3, 1e-9 },         /* m fix1 / sqrt(v fix2) = sign of g */
+        { -1e18f, 1e-3, 1e-9 },     /* v = 1e33, near the top of f32 */
+        { 1e-8f, -1e-3 / 2, 1e-9 }, /* as large as eps */
+        { 1e-25f, -1e-20, 1e-26 },  /* g^2 is no f32: eps carries the division */
+        { 0x1p-149f, 0, 1e-39 },    /* least number */
+    };
+    for (int l = 0; l < levels; l++) {
+        dar_cpu_init(level[l]);
+        for (size_t i = 0; i < DAR_COUNT(corner); i++) {
+            enum { N = 21 };
+            float w[N], m[N] = { 0 }, v[N] = { 0 }, g[N];
+            char what[64];
+            for (int k = 0; k < N; k++) w[k] = 0, g[k] = corner[i].g;
+            snprintf(what, sizeof what, "first step of gradient %g, %s", corner[i].g, dar_kern_for(DAR_F32)->name);
+            dar_kern_for(DAR_F32)->adamw(N, &adamw_first, w, m, v, g);
+            for (int k = 0; k < N; k++) CHECK_NEAR(what, w[k], corner[i].step, corner[i].bound);
+            for (int k = 0; k < N; k++)
+                CHECK(isfinite(m[k]) && isfinite(v[k]) && v[k] >= 0, "%s: moments %g %g", what, m[k], v[k]);
+        }
+        /* Nothing to learn: the weight decays by exactly rate decay, for ever. */
+        float w = 2, m = 0, v = 0, g = 0;
+        for (int t = 0; t < 100; t++) dar_kern_for(DAR_F32)->adamw(1, &adamw_first, &w, &m, &v, &g);
+        CHECK_NEAR("decay alone", w, 2 * pow(1 - 1e-4, 100), 100 * 0x1p-23);
+    }
+    dar_cpu_init(all);
 }
 
 /* ---------------------------------------------------------------- sizes */
@@ -300,8 +505,11 @@ int main(int argc, char **argv)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test_setup(flags_keep_arithmetic, setup),  cmocka_unit_test_setup(denormals_survive, setup),
         cmocka_unit_test_setup(bad_numbers_are_named, setup),  cmocka_unit_test_setup(long_sums_keep_digits, setup),
-        cmocka_unit_test_setup(views_reach_beyond_int, setup), cmocka_unit_test_setup(scans_reach_beyond_int, setup),
-        cmocka_unit_test_setup(plans_count_beyond_int, setup), cmocka_unit_test_setup(sizes_do_not_wrap, setup),
+        cmocka_unit_test_setup(logits_of_ten_thousand, setup), cmocka_unit_test_setup(masked_rows_are_zero, setup),
+        cmocka_unit_test_setup(equal_keys_fold, setup),        cmocka_unit_test_setup(tails_stay_relative, setup),
+        cmocka_unit_test_setup(adamw_corners, setup),          cmocka_unit_test_setup(views_reach_beyond_int, setup),
+        cmocka_unit_test_setup(scans_reach_beyond_int, setup), cmocka_unit_test_setup(plans_count_beyond_int, setup),
+        cmocka_unit_test_setup(sizes_do_not_wrap, setup),
     };
     dar_err e;
     full = argc > 1 && strcmp(argv[1], "full") == 0;
