@@ -23,7 +23,7 @@ typedef __m512 acc, bvec, avec;
 TILE(mm_6x64, 6, 4)
 TILE(mm_8x48, 8, 3)
 TILE(mm_12x32, 12, 2)
-TILE(mm_24x16, 24, 1)
+TILE(mm_12x16, 12, 1)
 
 static inline units along_f32(const void *p, size_t n)
 {
@@ -58,6 +58,6 @@ static const dar_tile of[] = {
     { "f32 6x64 avx512", DAR_TILE_F32, 1, 4, 6, 64, mm_6x64, &pack },
     { "f32 8x48 avx512", DAR_TILE_F32, 1, 4, 8, 48, mm_8x48, &pack },
     { "f32 12x32 avx512", DAR_TILE_F32, 1, 4, 12, 32, mm_12x32, &pack },
-    { "f32 24x16 avx512", DAR_TILE_F32, 1, 4, 24, 16, mm_24x16, &pack },
+    { "f32 12x16 avx512", DAR_TILE_F32, 1, 4, 12, 16, mm_12x16, &pack },
 };
 const dar_tile_set dar_tiles_f32_avx512 = { of, 4 };

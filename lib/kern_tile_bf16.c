@@ -24,7 +24,7 @@ typedef __m512bh bvec, avec;
 TILE(mm_6x64, 6, 4)
 TILE(mm_8x48, 8, 3)
 TILE(mm_12x32, 12, 2)
-TILE(mm_24x16, 24, 1)
+TILE(mm_12x16, 12, 1)
 
 /* n <= 16 elements as f32. */
 static inline __m512 get_f32(const void *p, size_t n)
@@ -95,6 +95,6 @@ static const dar_tile of[] = {
     { "bf16 6x64 avx512", DAR_TILE_BF16, 2, 4, 6, 64, mm_6x64, &pack },
     { "bf16 8x48 avx512", DAR_TILE_BF16, 2, 4, 8, 48, mm_8x48, &pack },
     { "bf16 12x32 avx512", DAR_TILE_BF16, 2, 4, 12, 32, mm_12x32, &pack },
-    { "bf16 24x16 avx512", DAR_TILE_BF16, 2, 4, 24, 16, mm_24x16, &pack },
+    { "bf16 12x16 avx512", DAR_TILE_BF16, 2, 4, 12, 16, mm_12x16, &pack },
 };
 const dar_tile_set dar_tiles_bf16 = { of, 4 };

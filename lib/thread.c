@@ -5,18 +5,24 @@
 
 #include "lib/status.h"
 
-static int wanted; /* 0: ask OpenMP */
+static _Atomic int wanted; /* 0: not known yet */
 static _Thread_local int self;
 
 int dar_threads(void)
 {
-    return wanted ? wanted : omp_get_max_threads();
+    if (!wanted) wanted = omp_get_max_threads(); /* once: others may change it */
+    return wanted;
 }
 
 void dar_threads_set(int n)
 {
     DAR_ASSERT(n >= 1, "threads: %d, expected at least 1", n);
     wanted = n;
+}
+
+bool dar_in_task(void)
+{
+    return omp_in_parallel();
 }
 
 void dar_parallel(size_t tasks, dar_task *fn, void *ctx)

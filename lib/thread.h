@@ -5,6 +5,7 @@
 #ifndef DAR_LIB_THREAD_H
 #define DAR_LIB_THREAD_H
 
+#include <stdbool.h>
 #include <stddef.h>
 
 /* Threads that dar_parallel uses.  The default is the number of processors, or OMP_NUM_THREADS. */
@@ -15,6 +16,9 @@ void dar_threads_set(int n); /* n >= 1 */
  * from inside a task it runs in place, as that same thread. */
 typedef void dar_task(void *ctx, size_t i, int thread);
 void dar_parallel(size_t tasks, dar_task *fn, void *ctx);
+
+/* Whether the caller is a task on one of several threads. */
+bool dar_in_task(void);
 
 /* Cut n items in chunks of `chunk` and run fn(ctx, begin, end, thread) on each. */
 typedef void dar_range_task(void *ctx, size_t begin, size_t end, int thread);

@@ -109,19 +109,19 @@ static dar_dtype operand(const dar_tile *t)
     return of[t->kind];
 }
 
-/* Stripe of `wide` lanes: element (lane j, k) of the stored matrix is at src[j * lane + k * step]. */
+/* By plain loops: element (lane j, k) of the stored matrix is at src[j * lane + k * step]. */
 static void pack_slow(const dar_tile *t, dar_dtype src_type, const void *src, size_t lane, size_t step, size_t lanes,
                       size_t k, size_t wide, void *dst)
 {
     dar_dtype to = operand(t);
-    size_t es = dar_dtype_size(to);
 
     memset(dst, 0, dar_tile_units(t, k) * wide * t->unit_bytes);
     for (size_t p = 0; p < k; p++)
         for (size_t j = 0; j < lanes; j++) {
             size_t from = j * lane + p * step, at = (p / t->unit * wide + j) * t->unit + p % t->unit;
             if (to == DAR_I8) ((uint8_t *)dst)[at] = ((const uint8_t *)src)[from];
-            else dar_dtype_set(to, (char *)dst + at * es, 0, dar_dtype_get(src_type, src, from));
+            else if (to == DAR_F64 && src_type == DAR_F64) ((double *)dst)[at] = ((const double *)src)[from];
+            else dar_dtype_set(to, dst, at, dar_dtype_get(src_type, src, from));
         }
 }
 

@@ -162,7 +162,7 @@ static void each_tile(void (*check)(const dar_tile *t))
     for (int l = 0; l < levels; l++) {
         dar_cpu_init(level[l]);
         for (int kind = 0; kind < DAR_TILE_KINDS; kind++) {
-            static const size_t shape[][2] = { { 6, 64 }, { 8, 48 }, { 12, 32 }, { 24, 16 }, { 12, 8 } };
+            static const size_t shape[][2] = { { 6, 64 }, { 8, 48 }, { 12, 32 }, { 12, 16 }, { 12, 8 } };
             const dar_tile *seen[DAR_COUNT(shape)] = { 0 };
             if (kind == DAR_TILE_BF16 && dar_tile_kind_for(DAR_BF16) != DAR_TILE_BF16) continue;
             for (size_t i = 0; i < DAR_COUNT(shape); i++) {

@@ -1,0 +1,239 @@
+/* gemm.c: matrices as operands of lib/product.c, and what happens to a finished tile of C. */
+#include "lib/gemm.h"
+
+#include <cblas.h>
+#include <string.h>
+
+#include "lib/cpu.h"
+#include "lib/kern.h"
+#include "lib/product.h"
+#include "lib/status.h"
+#include "lib/thread.h"
+
+/* ---------------------------------------------------------------- tiles by OpenBLAS */
+
+/* OpenBLAS multiplies f64, and f32 where there is no AVX2, one large tile at a time: where threads cut C is our choice,
+ * so bits do not depend on their number. */
+#define DEF_BLAS(NAME, REAL, GEMM)                                                                                     \
+    static void NAME(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c,            \
+                     size_t ldc, size_t m, size_t n, bool add)                                                         \
+    {                                                                                                                  \
+        bool rows = a_k == 1;                                                                                          \
+        DAR_ASSERT(ldc < INT32_MAX && a_row < INT32_MAX, "gemm: rows of 2^31 elements are more than OpenBLAS takes");  \
+        if (k)                                                                                                         \
+            GEMM(CblasRowMajor, rows ? CblasNoTrans : CblasTrans, CblasNoTrans, (int)m, (int)n, (int)k, 1, a,          \
+                 (int)(rows ? a_row : a_k), b, (int)b_k, add, c, (int)ldc);                                            \
+        for (size_t i = 0; !k && !add && i < m; i++) memset((REAL *)c + i * ldc, 0, n * sizeof(REAL));                 \
+    }
+DEF_BLAS(mm_dgemm, double, cblas_dgemm)
+DEF_BLAS(mm_sgemm, float, cblas_sgemm)
+
+#define BLAS_ROWS 48
+#define BLAS_COLS 96
+
+static const dar_tile blas_f64 = { "f64 openblas", DAR_TILE_F64, 1, 8, BLAS_ROWS, BLAS_COLS, mm_dgemm, NULL };
+static const dar_tile blas_f32 = { "f32 openblas", DAR_TILE_F32, 1, 4, BLAS_ROWS, BLAS_COLS, mm_sgemm, NULL };
+
+static const dar_tile *choose_tile(dar_tile_kind kind, size_t m, size_t n)
+{
+    if (kind == DAR_TILE_F64) return &blas_f64;
+    if (kind == DAR_TILE_F32 && !(dar_cpu_flags() & DAR_CPU_AVX2)) return &blas_f32;
+    return dar_tile_fit(kind, m, n);
+}
+
+/* ---------------------------------------------------------------- operands */
+
+#define PIECE 64 /* elements along k that are converted from 8 bits at a time */
+
+static void pack_lanes(const dar_tile *t, bool a, bool along, dar_dtype type, const void *src, size_t ld, size_t n,
+                       size_t k, void *dst)
+{
+    if (a) (along ? dar_tile_pack_a_mk : dar_tile_pack_a_km)(t, type, src, ld, n, k, dst);
+    else (along ? dar_tile_pack_b_nk : dar_tile_pack_b_kn)(t, type, src, ld, k, n, dst);
+}
+
+/* Rows of 8 bits, each with its scale, go through f32. */
+static void pack_i8(const dar_matrix *x, const dar_tile *t, bool a, bool along, size_t at, size_t n, size_t k0,
+                    size_t k, char *dst)
+{
+    float buf[BLAS_COLS * PIECE];
+    size_t wide = a ? t->mr : t->nr;
+    DAR_ASSERT(wide <= BLAS_COLS, "gemm: a stripe of %zu", wide);
+    for (size_t p = 0; p < k; p += PIECE) {
+        size_t kn = k - p < PIECE ? k - p : PIECE, rows = along ? n : kn, cols = along ? kn : n;
+        size_t row0 = along ? at : k0 + p, col0 = along ? k0 + p : at;
+        for (size_t i = 0; i < rows; i++) {
+            const int8_t *q = (const int8_t *)x->data + (row0 + i) * x->ld + col0;
+            float s = x->scale[row0 + i];
+            for (size_t j = 0; j < cols; j++) buf[i * cols + j] = s * q[j];
+        }
+        pack_lanes(t, a, along, DAR_F32, buf, cols, n, kn, dst + p / t->unit * wide * t->unit_bytes);
+    }
+}
+
+static void pack(const dar_matrix *x, const dar_tile *t, bool a, bool along, size_t at, size_t n, size_t k0, size_t k,
+                 void *dst)
+{
+    size_t from = along ? at * x->ld + k0 : k0 * x->ld + at;
+    if (x->type == DAR_I8 && t->kind != DAR_TILE_I8) pack_i8(x, t, a, along, at, n, k0, k, dst);
+    else pack_lanes(t, a, along, x->type, (const char *)x->data + from * dar_dtype_size(x->type), x->ld, n, k, dst);
+}
+
+/* ctx is the matrix.  Lanes of A are rows of the matrix, lanes of B columns. */
+static void pack_a(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *dst)
+{
+    const dar_matrix *x = ctx;
+    pack(x, t, true, !x->t, at, n, k0, k, dst);
+}
+
+static void pack_b(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *dst)
+{
+    const dar_matrix *x = ctx;
+    pack(x, t, false, x->t, at, n, k0, k, dst);
+}
+
+/* The same for the transposed product: B's columns are the rows of C^T. */
+static void pack_columns_a(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *dst)
+{
+    const dar_matrix *x = ctx;
+    pack(x, t, true, x->t, at, n, k0, k, dst);
+}
+
+static void pack_rows_b(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *dst)
+{
+    const dar_matrix *x = ctx;
+    pack(x, t, false, !x->t, at, n, k0, k, dst);
+}
+
+/* A's rows as the tile reads them: consecutive along k, and in whole units. */
+static bool lies_ready(const dar_tile *t, const dar_matrix *a, size_t k)
+{
+    static const dar_dtype of[] = { DAR_F64, DAR_F32, DAR_BF16, DAR_I8 };
+    return !a->t && a->type == of[t->kind] && k % t->unit == 0 && a->ld % t->unit == 0;
+}
+
+static dar_operand operand_a(const dar_tile *t, const dar_matrix *a, size_t k)
+{
+    bool ready = lies_ready(t, a, k);
+    return (dar_operand){ pack_a, a, ready ? a->data : NULL, ready, a->ld / t->unit };
+}
+
+/* ---------------------------------------------------------------- a finished tile */
+
+/* x = alpha x + bias, kept in pre, then y = act(x) into C: one row of n elements from column j on. */
+struct finish {
+    double alpha;
+    dar_dtype real, type;
+    void *c;
+    size_t ldc, n;
+    bool add;
+    const void *bias;
+    dar_dtype bias_type;
+    void *pre;
+    void (*act)(size_t n, const void *x, void *y);
+};
+
+static void finish_row(const struct finish *f, size_t i, size_t j, size_t n, void *x)
+{
+    size_t size = dar_dtype_size(f->real);
+    double bias[BLAS_COLS];
+    const void *b = f->bias ? (const char *)f->bias + j * dar_dtype_size(f->bias_type) : NULL;
+
+    if (b) b = dar_row_get(f->real, f->bias_type, b, n, bias);
+    if (f->real == DAR_F64) {
+        double *y = x;
+        for (size_t q = 0; f->alpha != 1 && q < n; q++) y[q] *= f->alpha;
+        for (size_t q = 0; b && q < n; q++) y[q] += ((const double *)b)[q];
+    } else {
+        float *y = x, alpha = (float)f->alpha;
+        for (size_t q = 0; f->alpha != 1 && q < n; q++) y[q] *= alpha;
+        for (size_t q = 0; b && q < n; q++) y[q] += ((const float *)b)[q];
+    }
+    if (f->pre) memcpy((char *)f->pre + (i * f->n + j) * size, x, n * size);
+    if (f->act) f->act(n, x, x);
+    dar_row_put(f->real, x, f->type, (char *)f->c + (i * f->ldc + j) * dar_dtype_size(f->type), n, f->add);
+}
+
+static void finish_tile(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
+{
+    const struct finish *f = ctx;
+    for (size_t r = 0; r < m; r++) finish_row(f, i + r, j, n, (char *)c + r * ldc * dar_dtype_size(f->real));
+}
+
+/* The tile holds columns of C as rows. */
+static void finish_transposed(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
+{
+    const struct finish *f = ctx;
+    double row[BLAS_COLS];
+    for (size_t q = 0; q < n; q++) {
+        if (f->real == DAR_F64)
+            for (size_t r = 0; r < m; r++) row[r] = ((const double *)c)[r * ldc + q];
+        else
+            for (size_t r = 0; r < m; r++) ((float *)row)[r] = ((const float *)c)[r * ldc + q];
+        finish_row(f, j + q, i, m, row);
+    }
+}
+
+/* ---------------------------------------------------------------- the product */
+
+dar_tile_kind dar_gemm_kind(dar_dtype a, dar_dtype b)
+{
+    if (a == DAR_F64 || b == DAR_F64) return DAR_TILE_F64;
+    return a == DAR_BF16 && b == DAR_BF16 ? dar_tile_kind_for(DAR_BF16) : DAR_TILE_F32;
+}
+
+/* Few columns and an A that must be packed anyway: C^T = B^T A^T packs it better, as wide stripes of B. */
+static bool better_transposed(const dar_gemm *g, const dar_tile *t)
+{
+    return g->n <= 96 && g->m > 2 * g->n && g->a.t && t->kind != DAR_TILE_F64;
+}
+
+static void describe(const dar_gemm *g, struct finish *f, dar_product *p)
+{
+    const dar_tile *t = choose_tile(g->kind, g->m, g->n);
+    dar_dtype real = g->kind == DAR_TILE_F64 ? DAR_F64 : DAR_F32;
+    bool flip = better_transposed(g, t);
+
+    *f = (struct finish){ g->alpha, real, g->type, g->c, g->ldc, g->n, g->add, g->bias, g->bias_type, g->pre, g->act };
+    *p = (dar_product){ .tile = t, .m = g->m, .n = g->n, .done = finish_tile, .ctx = f };
+    if (flip) {
+        *p = (dar_product){ choose_tile(g->kind, g->n, g->m), g->n, g->m, .done = finish_transposed, .ctx = f };
+        p->term[0] =
+            (dar_term){ g->k, { .pack = pack_columns_a, .ctx = &g->b }, { .pack = pack_rows_b, .ctx = &g->a } };
+        p->term[1] =
+            (dar_term){ g->k2, { .pack = pack_columns_a, .ctx = &g->b2 }, { .pack = pack_rows_b, .ctx = &g->a2 } };
+        return;
+    }
+    p->term[0] = (dar_term){ g->k, operand_a(t, &g->a, g->k), { .pack = pack_b, .ctx = &g->b } };
+    p->term[1] = (dar_term){ g->k2, operand_a(t, &g->a2, g->k2), { .pack = pack_b, .ctx = &g->b2 } };
+    if (g->type == real && !(g->add && g->alpha != 1)) {
+        p->direct = true;
+        p->c = g->c;
+        p->ldc = g->ldc;
+        p->add = g->add;
+        f->add = false; /* done by the tiles */
+        if (g->alpha == 1 && !g->bias && !g->pre && !g->act) p->done = NULL;
+    }
+}
+
+size_t dar_gemm_scratch(const dar_gemm *g)
+{
+    struct finish f;
+    dar_product p;
+    describe(g, &f, &p);
+    return dar_product_scratch(&p);
+}
+
+void dar_gemm_run(const dar_gemm *g, void *scratch)
+{
+    struct finish f;
+    dar_product p;
+
+    DAR_ASSERT(g->kind != DAR_TILE_I8 && (g->type == DAR_F64) == (g->kind == DAR_TILE_F64) && g->type != DAR_I8,
+               "gemm: C of type %s from tiles of kind %d", dar_dtype_name(g->type), (int)g->kind);
+    DAR_ASSERT(!g->add || !(g->bias || g->pre || g->act), "gemm: add with bias, pre or act");
+    describe(g, &f, &p);
+    /* OpenBLAS starts threads where it thinks it is alone; inside a task it does not. */
+    if ((p.tile == &blas_f64 || p.tile == &blas_f32) && !dar_in_task()) openblas_set_num_threads(1);
+    dar_product_run(&p, scratch);
+}

@@ -1,0 +1,232 @@
+/* product.c: how a product is cut.
+ *
+ *   columns of C in panels      so that B, packed over all of k, fits PANEL_BYTES; packed once, shared by all threads
+ *   a panel in tasks            about TASK_ROWS rows each; where there are few rows, columns are split too
+ *   k in blocks                 a stripe of B over a block and a task's rows of A stay in the second-level cache
+ *   tiles                       along the rows first: the stripe of B is read again and again, A streams past it
+ *
+ * With few rows (thin) the packing of B outweighs its use by the tiles: each task packs its own piece of B and uses it
+ * at once, while A is packed once and shared. */
+#include "lib/product.h"
+
+#include <stdint.h>
+
+#include "lib/arena.h"
+#include "lib/status.h"
+#include "lib/thread.h"
+
+#define TASK_ROWS        96
+#define TASKS_PER_THREAD 8
+#define BLOCK_UNITS      512
+#define BLOCK_UNITS_THIN 256
+#define PANEL_BYTES      ((size_t)24 << 20)
+#define PIECE_BYTES      ((size_t)256 << 10) /* of B, packed by a thin task */
+#define ACC_COLS         384                 /* columns summed in scratch at a time */
+
+struct plan {
+    const dar_product *p;
+    const dar_tile *t;
+    bool thin;
+    size_t rows, cols; /* stripes of A, of B */
+    size_t panel;      /* stripes of B packed at a time */
+    size_t tm, tn;     /* tasks along rows, and along the columns of a panel */
+    size_t task_rows;  /* most stripes of A in a task */
+    size_t piece;      /* stripes of B that a task finishes before the next */
+    size_t kc[2];      /* elements per block of each term */
+    size_t blocks;     /* of both terms */
+    size_t depth;      /* most units in a block */
+    size_t shared_bytes, a_bytes, b_bytes, c_bytes;
+    char *shared, *own; /* own: a_bytes, b_bytes, c_bytes for each thread */
+    size_t first;       /* stripe of B where the panel begins */
+};
+
+static size_t ceil_div(size_t a, size_t b)
+{
+    return a / b + (a % b != 0);
+}
+
+static size_t min(size_t a, size_t b)
+{
+    return a < b ? a : b;
+}
+
+static size_t align(size_t bytes)
+{
+    return (bytes + DAR_ALIGN - 1) / DAR_ALIGN * DAR_ALIGN;
+}
+
+/* Block b of the sum: its term, first element and length. */
+static const dar_term *block(const struct plan *s, size_t b, size_t *k0, size_t *k)
+{
+    const dar_term *term = s->p->term;
+    size_t first = term[0].k ? ceil_div(term[0].k, s->kc[0]) : 0, i = b >= first && term[1].k;
+    *k0 = (b - (i ? first : 0)) * s->kc[i];
+    *k = min(term[i].k - *k0, s->kc[i]);
+    return &term[i];
+}
+
+/* Equal blocks of whole cache lines, at most `units` each. */
+static void cut_k(struct plan *s, size_t units)
+{
+    s->blocks = 0;
+    s->depth = 1;
+    for (int i = 0; i < 2; i++) {
+        size_t k = s->p->term[i].k, line = DAR_ALIGN / s->t->unit_bytes * s->t->unit;
+        size_t n = ceil_div(k, units * s->t->unit);
+        s->kc[i] = n ? ceil_div(ceil_div(k, n), line) * line : 1;
+        s->blocks += ceil_div(k, s->kc[i]);
+        if (k && s->kc[i] / s->t->unit > s->depth) s->depth = s->kc[i] / s->t->unit;
+    }
+    if (!s->blocks) s->blocks = 1; /* nothing to sum: C is cleared, or kept */
+}
+
+static void cut(struct plan *s, const dar_product *p)
+{
+    const dar_tile *t = p->tile;
+    size_t threads = (size_t)dar_threads();
+
+    *s = (struct plan){ .p = p, .t = t, .rows = ceil_div(p->m, t->mr), .cols = ceil_div(p->n, t->nr) };
+    s->thin = p->m <= TASK_ROWS;
+    cut_k(s, s->thin ? BLOCK_UNITS_THIN : BLOCK_UNITS);
+
+    size_t stripe_a = s->depth * t->mr * t->unit_bytes, stripe_b = s->depth * t->nr * t->unit_bytes;
+    size_t elem = t->kind == DAR_TILE_F64 ? 8 : 4, want = TASKS_PER_THREAD * threads;
+    bool pack_a = (p->term[0].k && !p->term[0].a.in_place) || (p->term[1].k && !p->term[1].a.in_place);
+
+    if (s->thin) {
+        s->panel = s->cols;
+        s->tm = 1;
+        s->piece = min(s->cols, 1 + PIECE_BYTES / stripe_b);
+        s->tn = min(s->cols, ceil_div(ceil_div(s->cols, s->piece), threads) * threads);
+        if (s->tn < want) s->tn = min(s->cols, want);
+        s->piece = min(s->piece, ceil_div(s->cols, s->tn));
+    } else {
+        size_t fit = 1 + PANEL_BYTES / (s->blocks * stripe_b);
+        s->panel = ceil_div(s->cols, ceil_div(s->cols, fit));
+        s->tm = ceil_div(p->m, TASK_ROWS);
+        if (s->tm > threads) s->tm = min(s->rows, ceil_div(s->tm, threads) * threads);
+        s->tn = min(s->panel, ceil_div(want, s->tm));
+        s->piece = p->direct ? s->panel : min(s->panel, 1 + (ACC_COLS - 1) / t->nr);
+    }
+    s->task_rows = ceil_div(s->rows, s->tm);
+    s->shared_bytes = align(s->blocks * (s->thin ? s->rows * stripe_a : s->panel * stripe_b));
+    s->a_bytes = s->thin || !pack_a ? 0 : align(s->task_rows * stripe_a);
+    s->b_bytes = s->thin ? align(s->piece * stripe_b) : 0;
+    s->c_bytes = p->direct ? 0 : align(s->task_rows * t->mr * s->piece * t->nr * elem);
+}
+
+size_t dar_product_scratch(const dar_product *p)
+{
+    struct plan s;
+    if (!p->m || !p->n) return 0;
+    cut(&s, p);
+    return s.shared_bytes + (size_t)dar_threads() * (s.a_bytes + s.b_bytes + s.c_bytes);
+}
+
+/* ---------------------------------------------------------------- packing */
+
+/* One stripe over block b. */
+static void pack_stripe(const struct plan *s, bool of_a, size_t stripe, size_t b, void *dst)
+{
+    size_t k0, k, wide = of_a ? s->t->mr : s->t->nr, lanes = of_a ? s->p->m : s->p->n;
+    const dar_term *term = block(s, b, &k0, &k);
+    const dar_operand *x = of_a ? &term->a : &term->b;
+    if (k && !x->in_place) x->pack(x->ctx, s->t, stripe * wide, min(lanes - stripe * wide, wide), k0, k, dst);
+}
+
+/* Where the shared stripe `at` (of B in this panel; thin: of A) lies. */
+static char *shared_stripe(const struct plan *s, size_t b, size_t at)
+{
+    size_t stripes = s->thin ? s->rows : s->panel, wide = s->thin ? s->t->mr : s->t->nr;
+    return s->shared + (b * stripes + at) * s->depth * wide * s->t->unit_bytes;
+}
+
+static void pack_shared(void *ctx, size_t i, int thread)
+{
+    const struct plan *s = ctx;
+    (void)thread;
+    for (size_t b = 0; b < s->blocks; b++)
+        pack_stripe(s, s->thin, s->thin ? i : s->first + i, b, shared_stripe(s, b, i));
+}
+
+/* ---------------------------------------------------------------- multiplying */
+
+/* A task: stripes [r0, r1) of A by [c0, c1) of B.  a, b: packed for this block, or NULL: shared, or in place. */
+struct task {
+    size_t r0, r1, c0, c1;
+    char *a, *b, *c; /* this thread's memory */
+};
+
+/* Where C's tile (i, j) is summed. */
+static char *sum_at(const struct plan *s, const struct task *w, size_t i, size_t j, size_t *ldc)
+{
+    size_t elem = s->t->kind == DAR_TILE_F64 ? 8 : 4, row = i * s->t->mr, col = j * s->t->nr;
+    *ldc = s->p->direct ? s->p->ldc : s->piece * s->t->nr;
+    if (!s->p->direct) row -= w->r0 * s->t->mr, col -= w->c0 * s->t->nr;
+    return (s->p->direct ? (char *)s->p->c : w->c) + (row * *ldc + col) * elem;
+}
+
+static void multiply_block(const struct plan *s, const struct task *w, size_t b)
+{
+    const dar_tile *t = s->t;
+    size_t k0, k, stripe_a = s->depth * t->mr * t->unit_bytes, stripe_b = s->depth * t->nr * t->unit_bytes, ldc;
+    const dar_operand *a = &block(s, b, &k0, &k)->a;
+    bool add = b || (s->p->direct && s->p->add), last = b + 1 == s->blocks;
+
+    for (size_t j = w->c0; j < w->c1; j++) {
+        const char *pb = s->thin ? w->b + (j - w->c0) * stripe_b : shared_stripe(s, b, j - s->first);
+        size_t n = min(s->p->n - j * t->nr, t->nr);
+        for (size_t i = w->r0; i < w->r1; i++) {
+            const char *pa = s->thin ? shared_stripe(s, b, i) : w->a + (i - w->r0) * stripe_a;
+            size_t m = min(s->p->m - i * t->mr, t->mr), a_row = 1, a_k = t->mr;
+            char *c = sum_at(s, w, i, j, &ldc);
+            if (a->in_place) {
+                pa = (const char *)a->units + (i * t->mr * a->row + k0 / t->unit) * t->unit_bytes;
+                a_row = a->row, a_k = 1;
+            }
+            t->mm(dar_tile_units(t, k), pa, a_row, a_k, pb, t->nr, c, ldc, m, n, add);
+            if (last && s->p->done) s->p->done(s->p->ctx, i * t->mr, j * t->nr, m, n, c, ldc);
+        }
+    }
+}
+
+static void multiply(void *ctx, size_t i, int thread)
+{
+    const struct plan *s = ctx;
+    const dar_tile *t = s->t;
+    char *own = s->own + (size_t)thread * (s->a_bytes + s->b_bytes + s->c_bytes);
+    size_t r = i / s->tn, c = i % s->tn, panel = min(s->panel, s->cols - s->first);
+    struct task w = { .a = own, .b = own + s->a_bytes, .c = own + s->a_bytes + s->b_bytes };
+    size_t end = s->first + panel * (c + 1) / s->tn;
+
+    w.r0 = s->rows * r / s->tm;
+    w.r1 = s->rows * (r + 1) / s->tm;
+    for (w.c0 = s->first + panel * c / s->tn; w.c0 < end; w.c0 = w.c1) {
+        w.c1 = min(w.c0 + s->piece, end);
+        for (size_t b = 0; b < s->blocks; b++) {
+            for (size_t j = w.c0; s->thin && j < w.c1; j++)
+                pack_stripe(s, false, j, b, w.b + (j - w.c0) * s->depth * t->nr * t->unit_bytes);
+            for (size_t j = w.r0; !s->thin && j < w.r1; j++)
+                pack_stripe(s, true, j, b, w.a + (j - w.r0) * s->depth * t->mr * t->unit_bytes);
+            multiply_block(s, &w, b);
+        }
+    }
+}
+
+void dar_product_run(const dar_product *p, void *scratch)
+{
+    struct plan s;
+    if (!p->m || !p->n) return;
+    cut(&s, p);
+    s.shared = scratch;
+    s.own = s.shared + s.shared_bytes;
+    if (s.thin) {
+        dar_parallel(s.rows, pack_shared, &s);
+        dar_parallel(s.tn, multiply, &s);
+        return;
+    }
+    for (; s.first < s.cols; s.first += s.panel) {
+        dar_parallel(min(s.panel, s.cols - s.first), pack_shared, &s);
+        dar_parallel(s.tm * s.tn, multiply, &s);
+    }
+}
