@@ -171,7 +171,8 @@ void dar_json_reject(dar_json j, const char *key, const char *expected, ...)
     va_start(ap, expected);
     vsnprintf(text, sizeof text, expected, ap);
     va_end(ap);
-    if (j.item) fail_value(j, key, key ? cJSON_GetObjectItemCaseSensitive(j.item, key) : j.item, text);
+    const cJSON *x = j.item && key ? cJSON_GetObjectItemCaseSensitive(j.item, key) : j.item;
+    if (j.item) fail_value(j, key, key && cJSON_IsNull(x) ? NULL : x, text);
 }
 
 /* ---------------------------------------------------------------- documents */
