@@ -53,7 +53,7 @@ typedef struct bench_row {
     int64_t s[6];            /* sizes; what they mean is the kind's */
     bench_peak peak;         /* what the row is compared with */
     double bar[BENCH_PARTS]; /* least fraction of the peak; 0: none */
-    bool against_rival;      /* bar: not slower than OpenBLAS */
+    bool against_rival;      /* measure the rival too; bar: not slower */
 } bench_row;
 
 /* A row being measured. */
