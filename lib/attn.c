@@ -31,6 +31,7 @@
 struct job {
     const dar_attn *a;
     const dar_kern_attn *kern;
+    const dar_kern *rows;
     dar_tile_kind kind;
     dar_dtype real; /* type of numbers that are not operands */
     size_t real_size, operand_size;
@@ -76,6 +77,7 @@ static struct job job_of(const dar_attn *a, size_t block)
     j.kind = dar_tile_kind_for(half ? DAR_BF16 : wide ? DAR_F64 : DAR_F32);
     j.kern = dar_kern_attn_for(j.kind);
     j.real = wide ? DAR_F64 : DAR_F32;
+    j.rows = dar_kern_for(j.real);
     j.real_size = dar_dtype_size(j.real);
     j.operand_size = j.kind == DAR_TILE_BF16 ? 2 : j.real_size;
     j.B = (size_t)a->q.shape.d[0];
@@ -277,9 +279,9 @@ static void forward_finish(const struct job *j, const struct forward_scratch *f,
     for (size_t i = 0; i < rows; i++) {
         double sum = lanes_sum(j->real, f->sum + i * DAR_ATTN_LANES * j->real_size);
         char *y = row_at(&a->y, b * j->Nq + q0 + i, h * j->E);
-        void *to = a->y.dtype == j->real ? y : f->row;
-        j->kern->axpy(j->E, sum == 0 ? 0 : 1 / sum, f->o + i * j->E * j->real_size, to, false);
-        dar_row_put(j->real, to, a->y.dtype, y, j->E, false);
+        void *to = dar_row_out(j->real, a->y.dtype, y, DAR_PUT, f->row);
+        j->rows->scale(j->E, sum == 0 ? 0 : 1 / sum, f->o + i * j->E * j->real_size, to);
+        dar_row_put(j->real, to, a->y.dtype, y, j->E, DAR_PUT);
         if (!a->stats.data) continue;
         size_t at = (head * j->Nq + q0 + i) * 2;
         dar_dtype_set(j->real, a->stats.data, at, sum == 0 ? 0 : dar_dtype_get(j->real, f->max, i));
@@ -436,10 +438,10 @@ static void load_queries(const struct job *j, const struct backward_scratch *f, 
         size_t at = (head * j->Nq + q0 + i) * 2;
         double sum = dar_dtype_get(j->real, a->stats.data, at + 1);
         const void *y = dar_row_get(j->real, a->y.dtype, row_at(&a->y, row + i, col), j->E, f->row);
-        double dot = j->kern->scale_dot(j->E, sum == 0 ? 0 : 1 / sum, row_at(&a->gy, row + i, col), y,
-                                        f->gy + i * j->E * j->real_size);
+        char *gy = f->gy + i * j->E * j->real_size;
+        j->rows->scale(j->E, sum == 0 ? 0 : 1 / sum, row_at(&a->gy, row + i, col), gy);
         dar_dtype_set(j->real, f->max, i, dar_dtype_get(j->real, a->stats.data, at));
-        dar_dtype_set(j->real, f->dot, i, dot);
+        dar_dtype_set(j->real, f->dot, i, j->rows->dot(j->E, gy, y));
     }
     const void *q = row_at(&a->q, row, col);
     pack_rows(j->inner, false, a->q.dtype, q, j->D, n, j->E, f->q_rows);
@@ -488,7 +490,7 @@ static void store(const struct job *j, const dar_tensor *gx, size_t row, size_t 
                   const char *x, bool add)
 {
     for (size_t i = 0; i < n; i++)
-        j->kern->axpy(j->E, scale, x + i * j->E * j->real_size, row_at(gx, row + i, col), add);
+        (add ? j->rows->axpy : j->rows->scale)(j->E, scale, x + i * j->E * j->real_size, row_at(gx, row + i, col));
 }
 
 static void backward_task(void *ctx, size_t task, int thread)
@@ -525,8 +527,8 @@ static void add_splits(void *ctx, size_t begin, size_t end, int thread)
     (void)thread;
     for (size_t s = 1; s < j->splits; s++) {
         dar_tensor part = dq_of(j, s);
-        j->kern->axpy(end - begin, 1, (char *)part.data + begin * j->real_size,
-                      (char *)j->a->gq.data + begin * j->real_size, true);
+        char *to = (char *)j->a->gq.data + begin * j->real_size;
+        j->rows->add(end - begin, to, (char *)part.data + begin * j->real_size, to);
     }
 }
 

@@ -8,10 +8,16 @@ static dar_kern_attn table[DAR_TILE_KINDS];
 
 void dar_kern_attn_init(unsigned cpu_flags)
 {
+    table[DAR_TILE_F64] = dar_kern_attn_ref_f64;
+    table[DAR_TILE_F32] = dar_kern_attn_ref_f32;
+    table[DAR_TILE_BF16] = dar_kern_attn_ref_bf16;
+#if defined __x86_64__
+    if (cpu_flags & DAR_CPU_AVX2) table[DAR_TILE_F32] = dar_kern_attn_f32_avx2;
+    if (cpu_flags & DAR_CPU_AVX512) table[DAR_TILE_F32] = dar_kern_attn_f32_avx512;
+    if (cpu_flags & DAR_CPU_BF16) table[DAR_TILE_BF16] = dar_kern_attn_bf16;
+#else
     (void)cpu_flags;
-    dar_kern_attn_ref_f64(&table[DAR_TILE_F64]);
-    dar_kern_attn_ref_f32(&table[DAR_TILE_F32]);
-    dar_kern_attn_ref_bf16(&table[DAR_TILE_BF16]);
+#endif
 }
 
 const dar_kern_attn *dar_kern_attn_for(dar_tile_kind kind)

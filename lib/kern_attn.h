@@ -16,6 +16,7 @@
 #include "lib/tile.h"
 
 #define DAR_ATTN_LANES 16 /* partial sums per row */
+#define DAR_ATTN_PAD   32 /* rows of s, dp, p, ds and of numbers per column may be touched up to a multiple of this */
 
 /* A block of forward: rows are queries, columns keys. */
 typedef struct dar_attn_soft {
@@ -55,11 +56,6 @@ typedef struct dar_kern_attn {
      * whose t are all -inf keeps max -inf and gets weights 0.  NaN stays NaN. */
     void (*soft)(const dar_attn_soft *b);
     void (*grad)(const dar_attn_grad *b);
-
-    /* y = (add ? y : 0) + a x over n numbers. */
-    void (*axpy)(size_t n, double a, const void *x, void *y, bool add);
-    /* y = a x; returns sum of y z. */
-    double (*scale_dot)(size_t n, double a, const void *x, const void *z, void *y);
 } dar_kern_attn;
 
 const dar_kern_attn *dar_kern_attn_for(dar_tile_kind kind);
@@ -68,8 +64,7 @@ const dar_kern_attn *dar_kern_attn_for(dar_tile_kind kind);
 void dar_kern_attn_init(unsigned cpu_flags);
 
 /* The sets that fill them. */
-void dar_kern_attn_ref_f64(dar_kern_attn *k);
-void dar_kern_attn_ref_f32(dar_kern_attn *k);
-void dar_kern_attn_ref_bf16(dar_kern_attn *k);
+extern const dar_kern_attn dar_kern_attn_ref_f64, dar_kern_attn_ref_f32, dar_kern_attn_ref_bf16;
+extern const dar_kern_attn dar_kern_attn_f32_avx2, dar_kern_attn_f32_avx512, dar_kern_attn_bf16;
 
 #endif
