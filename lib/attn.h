@@ -28,8 +28,8 @@ typedef struct dar_attn {
     size_t heads;
     double scale; /* > 0 */
 
-    /* Row statistics (u, s): sum_j exp(l_ij) = s 2^u; (0, 0) without a key.  Forward writes them unless data is NULL.
-     */
+    /* Row statistics (m, s): sum_j exp(l_ij) = s exp(scale m), or s 2^m where lw is present; (0, 0) without a key.
+     * Forward writes them unless data is NULL. */
     dar_tensor stats; /* [B, heads, Nq, 2] */
 
     /* For backward: gq = (add_q ? gq : 0) + gradient, likewise gk, gv; data NULL: not wanted, its work is left out. */

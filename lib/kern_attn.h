@@ -1,8 +1,7 @@
 /* kern_attn.h: the vector work of attention: from a block of products to a block of weights, and rows at its edges.
  *
  * Weights are powers of two: with t_ij = c s_ij + lw_j, c = scale log2 e and lw in the same unit, a row's weights are
- * 2^(t_ij - max_i) / sum_i.  max_i need not be the row's maximum, only near enough that nothing overflows: the pair
- * (max, sum) means sum * 2^max.
+ * 2^(t_ij - max_i) / sum_i.  max_i need not be the row's maximum, only near enough that nothing overflows.
  *
  * One table per kind of tile that does the products.  Numbers (s, max, sum, o, ...) are f64 for DAR_TILE_F64, else f32;
  * operands (p, ds) are what that tile multiplies: f64, f32, or bf16 in pairs.  The reference text
@@ -27,7 +26,7 @@ typedef struct dar_attn_soft {
     const void *lw; /* [n] or NULL: all 0 */
     void *p;        /* weights as operands, row i at p + i ldp; an odd last pair is filled with 0; f32, f64: may be s */
     size_t ldp;     /* [elements] */
-    void *max;      /* [m], -inf before the first block */
+    void *max;      /* [m], -inf before the first block; in units of t, or of s if lw is NULL */
     void *sum;      /* [m, DAR_ATTN_LANES] */
     void *o;        /* [m, E], row i at o + i ldo: sums weighted so far */
     size_t ldo, E;
@@ -40,7 +39,7 @@ typedef struct dar_attn_grad {
     size_t ld;
     double c;
     const void *lw;  /* [m] or NULL */
-    const void *max; /* [n], finite */
+    const void *max; /* [n], finite, in units as above */
     const void *dot; /* [n]: sum of gy' y */
     void *p, *ds;    /* 2^(t - max) and p (dp - dot) as operands, row j at j ldp; an odd last pair is filled with 0;
                         f32, f64: may be s and dp.  NULL: not wanted */

@@ -13,7 +13,6 @@ typedef float operand;
 #define v_store(p, x)     _mm256_storeu_ps(p, x)
 #define v_set(x)          _mm256_set1_ps(x)
 #define v_fma(a, b, c)    _mm256_fmadd_ps(a, b, c)
-#define v_fms(a, b, c)    _mm256_fmsub_ps(a, b, c)
 #define v_max(a, b)       _mm256_max_ps(a, b)
 #define v_any_above(a, b) _mm256_movemask_ps(_mm256_cmp_ps(a, b, _CMP_GT_OQ))
 #define put(p, a, b)      (v_store(p, a), v_store((p) + LANES, b))
