@@ -106,5 +106,13 @@ stress: deps ## where numbers break: the tests of tests/test_stress.c at full si
 	@$(MAKE) --no-print-directory $B/test_stress
 	@$B/test_stress full
 
+$B/ulp: $B/tests/ulp.o $B/libdar.a
+	@echo "LD $@"
+	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS)
+
+ulp: ## exp, tanh, rsqrt, silu at all 2^32 arguments against f64, at every CPU level; a few minutes
+	@$(MAKE) --no-print-directory $B/ulp
+	@$B/ulp
+
 clean: ## remove build/
 	rm -rf build
