@@ -23,6 +23,36 @@ dar_val *dar_relu(dar_tape *t, dar_val *x);
 
 /* ---------------------------------------------------------------- norms and what surrounds them */
 
+/* Variations of norms. */
+typedef struct dar_norm_opt {
+    double eps; /* added to the mean square */
+    bool cast;  /* y has storage type `out`, not that of x */
+    dar_dtype out;
+    int64_t split; /* modulate: tokens per parameter row */
+} dar_norm_opt;
+
+/* Normalise the rows of the last dimension.
+ *
+ *   x      [.., D]
+ *   w, b   [D]       NULL: 1, 0
+ *
+ *   rms_norm    y = x / sqrt(mean(x^2) + eps) w
+ *   layer_norm  y = (x - mean(x)) / sqrt(mean((x - mean(x))^2) + eps) w + b
+ *
+ * Statistics are f64 sums in two passes: rows of 1e4 + tiny come out right, rows of zeros finite.  Saves three numbers
+ * per row.  Sources: Zhang and Sennrich 2019, eq. 4; Ba et al. 2016, eq. 4. */
+dar_val *dar_rms_norm(dar_tape *t, dar_val *x, dar_val *w, const dar_norm_opt *o);
+dar_val *dar_layer_norm(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, const dar_norm_opt *o);
+
+/* Layer norm with a scale and a shift that depend on the token's place: y = layer_norm(x) (1 + scale) + shift.
+ *
+ *   x              [B, N, D]
+ *   scale, shift   [B, R, D]   token i takes row min(i / split, R - 1); R = 1: split is not used
+ *
+ * R = 2 is a clip whose first frame (split tokens) has a time of its own.  Source: Peebles and Xie 2022, section 3.2.
+ */
+dar_val *dar_modulate(dar_tape *t, dar_val *x, dar_val *scale, dar_val *shift, const dar_norm_opt *o);
+
 /* ---------------------------------------------------------------- products */
 
 /* ---------------------------------------------------------------- attention */

@@ -56,6 +56,7 @@ typedef struct dar_kern {
 
     void (*add)(size_t n, const void *a, const void *b, void *y);                    /* y = a + b */
     void (*mul)(size_t n, const void *a, const void *b, void *y);                    /* y = a b */
+    void (*offset)(size_t n, double a, const void *x, void *y);                      /* y = a + x */
     void (*scale)(size_t n, double a, const void *x, void *y);                       /* y = a x */
     void (*axpy)(size_t n, double a, const void *x, void *y);                        /* y += a x */
     void (*mul_add)(size_t n, const void *a, const void *b, const void *c, void *y); /* y = a b + c */
