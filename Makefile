@@ -102,7 +102,7 @@ lint: ## the quick half of check: layers, style, format, headers alone
 check: ## lint, then gcc, clang, debug and sanitizer builds, tests in release and under sanitizers
 	@scripts/check.sh
 
-stress: deps ## where numbers break: the tests of tests/test_stress.c at full size
+stress: deps ## where numbers break: tests/test_stress.c, with the tests that take gigabytes of memory
 	@$(MAKE) --no-print-directory $B/test_stress
 	@$B/test_stress full
 

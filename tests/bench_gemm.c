@@ -4,78 +4,156 @@
 
 #include <cblas.h>
 
+#include "lib/gemm.h"
 #include "lib/status.h"
 #include "lib/thread.h"
 
-/* Sizes of a row: M tokens, N outputs, K inputs of a linear layer. */
-
-/* ---------------------------------------------------------------- OpenBLAS */
-
-/* The operands in f32: A, B, C as the three products of a layer use them. */
-struct blas {
-    float *x, *w, *y; /* [M, K], [N, K], [M, N] */
+/* A row is a linear layer of M tokens, N outputs, K inputs: x [M, K], w [N, K], y [M, N].  Its three products:
+ *
+ *   gemm_nt   y  = x w^T      forward
+ *   gemm_nn   gx = gy w       gy is f32, whatever x and w are stored as
+ *   gemm_tn   gw = gy^T x */
+struct layer {
+    dar_gemm gemm;
+    void *scratch;
+    float *x, *w, *y; /* for OpenBLAS */
 };
-
-static void setup_blas(bench *b)
-{
-    struct blas *p = dar_arena_push(b->arena, sizeof *p);
-    p->x = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[2])).data;
-    p->w = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[1], b->s[2])).data;
-    p->y = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[1])).data;
-    b->state = p;
-    b->flops[0] = 2.0 * (double)b->s[0] * (double)b->s[1] * (double)b->s[2];
-}
 
 const char *bench_blas_core(void)
 {
     return openblas_get_corename();
 }
 
-/* y = x w^T */
+static struct layer *setup_layer(bench *b)
+{
+    struct layer *l = dar_arena_push(b->arena, sizeof *l);
+    *l = (struct layer){ 0 };
+    b->state = l;
+    b->flops[0] = 2.0 * (double)b->s[0] * (double)b->s[1] * (double)b->s[2];
+    if (!b->row->against_rival) return l;
+    l->x = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[2])).data;
+    l->w = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[1], b->s[2])).data;
+    l->y = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[1])).data;
+    return l;
+}
+
+static dar_matrix matrix(bench *b, dar_dtype type, int64_t rows, int64_t columns, bool t)
+{
+    return (dar_matrix){ type, bench_tensor(b, type, DAR_SHAPE(rows, columns)).data, (size_t)columns, t, NULL };
+}
+
+/* C [m, n] = a b over k, stored as type. */
+static void setup_gemm(bench *b, int64_t m, int64_t n, int64_t k, dar_matrix p, dar_matrix q, dar_dtype type)
+{
+    struct layer *l = b->state;
+    l->gemm = (dar_gemm){ .kind = dar_gemm_kind(b->row->type, b->row->type),
+                          .m = (size_t)m,
+                          .n = (size_t)n,
+                          .k = (size_t)k,
+                          .a = p,
+                          .b = q,
+                          .alpha = 1,
+                          .type = type,
+                          .c = bench_tensor(b, type, DAR_SHAPE(m, n)).data,
+                          .ldc = (size_t)n };
+    l->scratch = dar_arena_push(b->arena, dar_gemm_scratch(&l->gemm));
+}
+
+static void run_gemm(bench *b)
+{
+    const struct layer *l = b->state;
+    dar_gemm_run(&l->gemm, l->scratch);
+}
+
+/* ---------------------------------------------------------------- y = x w^T */
+
+static void setup_nt(bench *b)
+{
+    int64_t M = b->s[0], N = b->s[1], K = b->s[2];
+    dar_dtype t = b->row->type;
+    setup_layer(b);
+    setup_gemm(b, M, N, K, matrix(b, t, M, K, false), matrix(b, t, N, K, true), t);
+}
+
 static void blas_nt(bench *b)
 {
-    const struct blas *p = b->state;
+    const struct layer *l = b->state;
     int M = (int)b->s[0], N = (int)b->s[1], K = (int)b->s[2];
     openblas_set_num_threads(dar_threads());
-    cblas_sgemm(CblasRowMajor, CblasNoTrans, CblasTrans, M, N, K, 1, p->x, K, p->w, K, 0, p->y, N);
+    cblas_sgemm(CblasRowMajor, CblasNoTrans, CblasTrans, M, N, K, 1, l->x, K, l->w, K, 0, l->y, N);
 }
 
-/* gx = gy w */
+/* ---------------------------------------------------------------- gx = gy w */
+
+static void setup_nn(bench *b)
+{
+    int64_t M = b->s[0], N = b->s[1], K = b->s[2];
+    setup_layer(b);
+    setup_gemm(b, M, K, N, matrix(b, DAR_F32, M, N, false), matrix(b, b->row->type, N, K, false), DAR_F32);
+}
+
 static void blas_nn(bench *b)
 {
-    const struct blas *p = b->state;
+    const struct layer *l = b->state;
     int M = (int)b->s[0], N = (int)b->s[1], K = (int)b->s[2];
     openblas_set_num_threads(dar_threads());
-    cblas_sgemm(CblasRowMajor, CblasNoTrans, CblasNoTrans, M, K, N, 1, p->y, N, p->w, K, 0, p->x, K);
+    cblas_sgemm(CblasRowMajor, CblasNoTrans, CblasNoTrans, M, K, N, 1, l->y, N, l->w, K, 0, l->x, K);
 }
 
-/* gw = gy^T x */
+/* ---------------------------------------------------------------- gw = gy^T x */
+
+static void setup_tn(bench *b)
+{
+    int64_t M = b->s[0], N = b->s[1], K = b->s[2];
+    setup_layer(b);
+    setup_gemm(b, N, K, M, matrix(b, DAR_F32, M, N, true), matrix(b, b->row->type, M, K, false), DAR_F32);
+}
+
 static void blas_tn(bench *b)
 {
-    const struct blas *p = b->state;
+    const struct layer *l = b->state;
     int M = (int)b->s[0], N = (int)b->s[1], K = (int)b->s[2];
     openblas_set_num_threads(dar_threads());
-    cblas_sgemm(CblasRowMajor, CblasTrans, CblasNoTrans, N, K, M, 1, p->y, N, p->x, K, 0, p->w, K);
+    cblas_sgemm(CblasRowMajor, CblasTrans, CblasNoTrans, N, K, M, 1, l->y, N, l->x, K, 0, l->w, K);
 }
-
-static const bench_kind nt = { .part = { "openblas_nt" }, .setup = setup_blas, .run = { blas_nt } };
-static const bench_kind nn = { .part = { "openblas_nn" }, .setup = setup_blas, .run = { blas_nn } };
-static const bench_kind tn = { .part = { "openblas_tn" }, .setup = setup_blas, .run = { blas_tn } };
 
 /* ---------------------------------------------------------------- rows */
 
-#define LAYER(kind, type, M, N, K, peak, bar)                                                                          \
+static const bench_kind nt = { .part = { "gemm_nt" }, .setup = setup_nt, .run = { run_gemm }, .rival = blas_nt };
+static const bench_kind nn = { .part = { "gemm_nn" }, .setup = setup_nn, .run = { run_gemm }, .rival = blas_nn };
+static const bench_kind tn = { .part = { "gemm_tn" }, .setup = setup_tn, .run = { run_gemm }, .rival = blas_tn };
+
+#define LAYER(kind, type, peak, bar, M, N, K)                                                                          \
     {                                                                                                                  \
         &kind, type, { M, N, K }, peak, { bar }, type == DAR_F32                                                       \
     }
-#define LAYERS(kind, type, M, peak, bar)                                                                               \
-    LAYER(kind, type, M, 384, 384, peak, bar), LAYER(kind, type, M, 1536, 384, peak, bar),                             \
-        LAYER(kind, type, M, 384, 1536, peak, bar), LAYER(kind, type, M, 3072, 3072, peak, bar),                       \
-        LAYER(kind, type, M, 14336, 3072, peak, bar), LAYER(kind, type, M, 3072, 14336, peak, bar)
+#define LAYERS(kind, type, peak, bar, M)                                                                               \
+    LAYER(kind, type, peak, bar, M, 384, 384), LAYER(kind, type, peak, bar, M, 1536, 384),                             \
+        LAYER(kind, type, peak, bar, M, 384, 1536), LAYER(kind, type, peak, bar, M, 3072, 3072),                       \
+        LAYER(kind, type, peak, bar, M, 14336, 3072), LAYER(kind, type, peak, bar, M, 3072, 14336)
+
+/* Down to the rank and up again. */
+#define THIN(kind, D, R)                                                                                               \
+    LAYER(kind, DAR_F32, BENCH_F32, 0.6, 2048, R, D), LAYER(kind, DAR_F32, BENCH_F32, 0.6, 2048, D, R)
+#define THINS(kind)                                                                                                    \
+    THIN(kind, 384, 16), THIN(kind, 384, 32), THIN(kind, 384, 64), THIN(kind, 384, 256), THIN(kind, 3072, 16),         \
+        THIN(kind, 3072, 32), THIN(kind, 3072, 64), THIN(kind, 3072, 256)
 
 const bench_row bench_product_rows[] = {
-    LAYERS(nt, DAR_F32, 2048, BENCH_F32, 0),
-    LAYERS(nn, DAR_F32, 2048, BENCH_F32, 0),
-    LAYERS(tn, DAR_F32, 2048, BENCH_F32, 0),
+    LAYERS(nt, DAR_F32, BENCH_F32, 0.88, 2048),
+    LAYERS(nt, DAR_F32, BENCH_F32, 0.88, 8192),
+    LAYERS(nn, DAR_F32, BENCH_F32, 0.88, 2048),
+    LAYERS(nn, DAR_F32, BENCH_F32, 0.88, 8192),
+    LAYERS(tn, DAR_F32, BENCH_F32, 0.88, 2048),
+    LAYERS(tn, DAR_F32, BENCH_F32, 0.88, 8192),
+    LAYERS(nt, DAR_BF16, BENCH_BF16, 0.86, 2048),
+    LAYERS(nt, DAR_BF16, BENCH_BF16, 0.86, 8192),
+    LAYERS(nn, DAR_BF16, BENCH_BF16, 0.83, 2048),
+    LAYERS(nn, DAR_BF16, BENCH_BF16, 0.83, 8192),
+    LAYERS(tn, DAR_BF16, BENCH_BF16, 0.83, 2048),
+    LAYERS(tn, DAR_BF16, BENCH_BF16, 0.83, 8192),
+    THINS(nt),
+    THINS(nn),
+    THINS(tn),
 };
 const size_t bench_n_product_rows = DAR_COUNT(bench_product_rows);

@@ -1,15 +1,15 @@
 /* test_stress.c: the places where numbers break, one test each: numbers far too large, too small, or not numbers, sums
  * too long for their type, sizes too large for an int.  What is asked is a right answer, not merely a finite one.
  *
- * With the argument "full" (make stress) sizes are those of real clips; otherwise the same tests run on small ones. */
+ * With the argument "full" (make stress) those follow that need gigabytes of memory. */
 #include "tests/test.h"
 
 #include <sys/mman.h>
 
 #include "autograd/ops.h"
+#include "lib/gemm.h"
 #include "lib/kern.h"
 
-static bool full;
 static dar_arena arena;
 static dar_tape tape;
 
@@ -378,6 +378,7 @@ static void *reserve(size_t bytes)
 {
     void *p = mmap(NULL, bytes, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
     CHECK(p != MAP_FAILED, "cannot reserve %zu bytes of address space", bytes);
+    madvise(p, bytes, MADV_HUGEPAGE); /* fewer pages of zeros to map where it is only read */
     return p;
 }
 
@@ -411,11 +412,37 @@ static void views_reach_beyond_int(void **state)
     munmap(p, bytes);
 }
 
+/* Operands and result whose rows lie 2^31 elements apart. */
+static void products_reach_beyond_int(void **state)
+{
+    (void)state;
+    enum { M = 2, N = 3, K = 5 };
+    size_t ld = (size_t)BEYOND + 5, bytes = N * ld * sizeof(float);
+    float *a = reserve(bytes), *b = reserve(bytes), *c = reserve(bytes);
+    for (size_t k = 0; k < K; k++) {
+        for (size_t i = 0; i < M; i++) a[i * ld + k] = (float)(i + k + 1);
+        for (size_t j = 0; j < N; j++) b[j * ld + k] = (float)(10 * j + k);
+    }
+    dar_gemm g = { .kind = DAR_TILE_F32, .m = M, .n = N, .k = K, .alpha = 1, .type = DAR_F32, .c = c, .ldc = ld };
+    g.a = (dar_matrix){ .type = DAR_F32, .data = a, .ld = ld };
+    g.b = (dar_matrix){ .type = DAR_F32, .data = b, .ld = ld, .t = true };
+    dar_gemm_run(&g, dar_arena_push(&arena, dar_gemm_scratch(&g)));
+    for (size_t i = 0; i < M; i++)
+        for (size_t j = 0; j < N; j++) {
+            double sum = 0;
+            for (size_t k = 0; k < K; k++) sum += (double)a[i * ld + k] * b[j * ld + k];
+            CHECK_NEAR("product", c[i * ld + j], sum, 0);
+        }
+    CHECK_NEAR("beside the product", c[ld + N], 0, 0);
+    munmap(a, bytes);
+    munmap(b, bytes);
+    munmap(c, bytes);
+}
+
 /* One contiguous tensor past 2^31 elements; its pages are the kernel's page of zeros until written. */
 static void scans_reach_beyond_int(void **state)
 {
     (void)state;
-    if (!full) return;
     int64_t n = BEYOND + 1001;
     uint16_t *p = reserve((size_t)n * 2);
     dar_tensor x = dar_tensor_of(DAR_BF16, DAR_SHAPE(n), p);
@@ -423,6 +450,25 @@ static void scans_reach_beyond_int(void **state)
     assert_int_equal(dar_tensor_nonfinite(&x), n - 1);
     p[n - 1] = dar_bf16_from_f32(2);
     assert_int_equal(dar_tensor_nonfinite(&x), -1);
+    munmap(p, (size_t)n * 2);
+}
+
+/* An op over as many elements, 4 GiB in and 4 GiB out: only at full size. */
+static void ops_reach_beyond_int(void **state)
+{
+    (void)state;
+    int64_t n = BEYOND + 1001;
+    uint16_t *p = reserve((size_t)n * 2);
+    dar_arena large;
+    dar_tape t;
+    assert_int_equal(dar_arena_init(&large, "large", ((size_t)n + 4096) * 2, NULL), DAR_OK);
+    assert_int_equal(dar_tape_init(&t, &large, NULL), DAR_OK);
+    for (int64_t i = n - 5; i < n; i++) p[i] = dar_bf16_from_f32((float)(i - n + 3));
+    dar_val *y = dar_relu(&t, dar_leaf(&t, dar_tensor_of(DAR_BF16, DAR_SHAPE(n), p), NULL));
+    for (int64_t i = n - 5; i < n; i++) CHECK_NEAR("relu", at(&y->x, (size_t)i), fmax(0, (double)(i - n + 3)), 0);
+    assert_int_equal(dar_tensor_nonfinite(&y->x), -1);
+    dar_tape_free(&t);
+    dar_arena_free(&large);
     munmap(p, (size_t)n * 2);
 }
 
@@ -503,21 +549,31 @@ static void long_sums_keep_digits(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test_setup(flags_keep_arithmetic, setup),  cmocka_unit_test_setup(denormals_survive, setup),
-        cmocka_unit_test_setup(bad_numbers_are_named, setup),  cmocka_unit_test_setup(long_sums_keep_digits, setup),
-        cmocka_unit_test_setup(logits_of_ten_thousand, setup), cmocka_unit_test_setup(masked_rows_are_zero, setup),
-        cmocka_unit_test_setup(equal_keys_fold, setup),        cmocka_unit_test_setup(tails_stay_relative, setup),
-        cmocka_unit_test_setup(adamw_corners, setup),          cmocka_unit_test_setup(views_reach_beyond_int, setup),
-        cmocka_unit_test_setup(scans_reach_beyond_int, setup), cmocka_unit_test_setup(plans_count_beyond_int, setup),
+        cmocka_unit_test_setup(flags_keep_arithmetic, setup),
+        cmocka_unit_test_setup(denormals_survive, setup),
+        cmocka_unit_test_setup(bad_numbers_are_named, setup),
+        cmocka_unit_test_setup(long_sums_keep_digits, setup),
+        cmocka_unit_test_setup(logits_of_ten_thousand, setup),
+        cmocka_unit_test_setup(masked_rows_are_zero, setup),
+        cmocka_unit_test_setup(equal_keys_fold, setup),
+        cmocka_unit_test_setup(tails_stay_relative, setup),
+        cmocka_unit_test_setup(adamw_corners, setup),
+        cmocka_unit_test_setup(views_reach_beyond_int, setup),
+        cmocka_unit_test_setup(products_reach_beyond_int, setup),
+        cmocka_unit_test_setup(scans_reach_beyond_int, setup),
+        cmocka_unit_test_setup(plans_count_beyond_int, setup),
         cmocka_unit_test_setup(sizes_do_not_wrap, setup),
     };
+    const struct CMUnitTest large[] = {
+        cmocka_unit_test_setup(ops_reach_beyond_int, setup),
+    };
     dar_err e;
-    full = argc > 1 && strcmp(argv[1], "full") == 0;
     if (dar_arena_init(&arena, "stress", (size_t)4 << 30, &e) != DAR_OK || dar_tape_init(&tape, &arena, &e) != DAR_OK) {
         fprintf(stderr, "test_stress: %s\n", e.text);
         return 3;
     }
     int failures = cmocka_run_group_tests(tests, NULL, NULL);
+    if (argc > 1 && strcmp(argv[1], "full") == 0) failures += cmocka_run_group_tests(large, NULL, NULL);
     dar_tape_free(&tape);
     dar_arena_free(&arena);
     return failures != 0;
