@@ -32,6 +32,54 @@ static const bench_kind silu = { BENCH_OP(silu), .inputs = one, .call = call_sil
 static const bench_kind gelu_tanh = { BENCH_OP(gelu_tanh), .inputs = one, .call = call_gelu_tanh };
 static const bench_kind relu = { BENCH_OP(relu), .inputs = one, .call = call_relu };
 
+/* ---------------------------------------------------------------- norms: tokens, width */
+
+static void tokens_and_vectors(bench *b, int vectors)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1]), true);
+    for (int i = 0; i < vectors; i++) bench_input(b, DAR_F32, DAR_SHAPE(b->s[1]), true);
+}
+
+static void tokens_weight(bench *b)
+{
+    tokens_and_vectors(b, 1);
+}
+
+static void tokens_weight_bias(bench *b)
+{
+    tokens_and_vectors(b, 2);
+}
+
+static void tokens_rows(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1]), true);
+    for (int i = 0; i < 2; i++) bench_input(b, DAR_F32, DAR_SHAPE(1, 2, b->s[1]), true);
+}
+
+static const dar_norm_opt norm_opt = { .eps = 1e-6, .split = 390 }; /* tokens of a first frame of 240 x 416 */
+
+static dar_val *call_rms_norm(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_rms_norm(t, x[0], x[1], &norm_opt);
+}
+
+static dar_val *call_layer_norm(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_layer_norm(t, x[0], x[1], x[2], &norm_opt);
+}
+
+static dar_val *call_modulate(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_modulate(t, x[0], x[1], x[2], &norm_opt);
+}
+
+static const bench_kind rms_norm = { BENCH_OP(rms_norm), .inputs = tokens_weight, .call = call_rms_norm };
+static const bench_kind layer_norm = { BENCH_OP(layer_norm), .inputs = tokens_weight_bias, .call = call_layer_norm };
+static const bench_kind modulate = { BENCH_OP(modulate), .inputs = tokens_rows, .call = call_modulate };
+
 /* ---------------------------------------------------------------- shape: heads to the front, a slice, a concatenation
  */
 
@@ -147,6 +195,9 @@ const bench_row bench_op_rows[] = {
     CONV(conv3d, 256, 256, 1, 128, 224), /* VAE decoder, last stage */
     CONV(conv3d, 160, 160, 4, 64, 112),  /* VAE encoder, first stage */
 
+    STREAM(rms_norm, 8192, 3072),
+    STREAM(layer_norm, 8192, 3072),
+    STREAM(modulate, 8192, 3072),
     STREAM(silu, 8192, 3072),
     STREAM(gelu_tanh, 8192, 3072),
     STREAM(relu, 8192, 3072),

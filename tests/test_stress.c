@@ -264,6 +264,58 @@ static void equal_keys_fold(void **state)
     check_all("gradient of q, one key", &x[0]->g, 0, 1e-5);
 }
 
+/* ---------------------------------------------------------------- norms */
+
+/* 1e4 + tiny: the mean has all the digits that x has, the spread a few of the last. */
+static void norms_far_from_zero(void **state)
+{
+    (void)state;
+    enum { D = 3072 };
+    static float x[D];
+    dar_norm_opt o = { .eps = 1e-6 };
+    long double mean = 0, square = 0, spread = 0;
+    for (int i = 0; i < D; i++) x[i] = 1e4f + (float)(i * 37 % 11 - 5) * 0x1p-10f; /* units of the last place */
+    for (int i = 0; i < D; i++) mean += x[i] / (long double)D, square += (long double)x[i] * x[i] / D;
+    for (int i = 0; i < D; i++) spread += (x[i] - mean) * (x[i] - mean) / D;
+
+    dar_val *in = leaf(DAR_SHAPE(1, D), x, true), *y = dar_layer_norm(&tape, in, NULL, NULL, &o);
+    for (size_t i = 0; i < D; i++)
+        CHECK_NEAR("layer norm of 1e4 + tiny", at(&y->x, i), (double)((x[i] - mean) / sqrtl(spread + 1e-6L)),
+                   4 * 0x1p-23);
+    sweep(y); /* of ones: a layer norm does not change when x moves as a whole; 1 / sqrt of the spread is 270 */
+    check_all("gradient of a constant", &in->g, 0, 1e-3);
+
+    in = leaf(DAR_SHAPE(1, D), x, true);
+    y = dar_rms_norm(&tape, in, NULL, &o);
+    for (size_t i = 0; i < D; i++)
+        CHECK_NEAR("RMS norm of 1e4 + tiny", at(&y->x, i), (double)(x[i] / sqrtl(square + 1e-6L)), 4 * 0x1p-23);
+}
+
+/* eps keeps rows of zeros, and rows that do not vary, finite in both directions. */
+static void norms_of_nothing(void **state)
+{
+    (void)state;
+    enum { D = 37 };
+    static const float value[] = { 0, 1e-30f, 3, -1e4f, 1e18f };
+    dar_norm_opt o = { .eps = 1e-6 };
+    for (size_t k = 0; k < DAR_COUNT(value); k++) {
+        float x[D];
+        for (int i = 0; i < D; i++) x[i] = value[k];
+        double size = sqrt((double)value[k] * value[k] + 1e-6);
+
+        dar_val *in = leaf(DAR_SHAPE(1, D), x, true), *y = dar_layer_norm(&tape, in, NULL, NULL, &o);
+        check_all("layer norm of a constant row", &y->x, 0, 0);
+        sweep(y); /* 1 / sqrt(eps) = 1000 times ones without their mean */
+        check_all("gradient of a constant row", &in->g, 0, 1000 * 0x1p-23);
+
+        in = leaf(DAR_SHAPE(1, D), x, true);
+        y = dar_rms_norm(&tape, in, NULL, &o);
+        check_all("RMS norm of a constant row", &y->x, value[k] / size, 0x1p-22);
+        sweep(y); /* 1/r - x^2/r^3 = eps/r^3 for equal x */
+        check_all("gradient of RMS norm", &in->g, 1e-6 / (size * size * size), 0x1p-20 / size);
+    }
+}
+
 /* ---------------------------------------------------------------- tails of activations */
 
 struct activation {
@@ -556,6 +608,8 @@ int main(int argc, char **argv)
         cmocka_unit_test_setup(logits_of_ten_thousand, setup),
         cmocka_unit_test_setup(masked_rows_are_zero, setup),
         cmocka_unit_test_setup(equal_keys_fold, setup),
+        cmocka_unit_test_setup(norms_far_from_zero, setup),
+        cmocka_unit_test_setup(norms_of_nothing, setup),
         cmocka_unit_test_setup(tails_stay_relative, setup),
         cmocka_unit_test_setup(adamw_corners, setup),
         cmocka_unit_test_setup(views_reach_beyond_int, setup),
