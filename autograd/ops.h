@@ -53,6 +53,45 @@ dar_val *dar_layer_norm(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, const d
  */
 dar_val *dar_modulate(dar_tape *t, dar_val *x, dar_val *scale, dar_val *shift, const dar_norm_opt *o);
 
+/* Gated residual: y = x + g u.
+ *
+ *   x, u   [B, N, D]
+ *   g      [B, R, D]   rows as for dar_modulate */
+typedef struct dar_gate_attr {
+    int64_t split;
+} dar_gate_attr;
+dar_val *dar_gate(dar_tape *t, dar_val *x, dar_val *u, dar_val *g, int64_t split);
+
+/* Norm over channels: y = x / max(||x||, 1e-12) sqrt(C) w at every place, ||x|| over the channels there.
+ *
+ *   x   [B, C, ..]   at least one dimension after C
+ *   w   [C]
+ *
+ * Source: the reference VAE, RMS_norm. */
+dar_val *dar_channel_norm(dar_tape *t, dar_val *x, dar_val *w);
+
+/* Rotate the pairs (x[2i], x[2i + 1]) of every head by the token's position.
+ *
+ *   x       [B, N, D]   D = heads E
+ *   table   [N, E]      cos a, sin a of pair i at [2i], [2i + 1]; f32 or f64, frozen; E even, at most DAR_PIECE
+ *
+ *   y[2i]     = x[2i] cos a - x[2i + 1] sin a
+ *   y[2i + 1] = x[2i] sin a + x[2i + 1] cos a
+ *
+ * Source: Su et al. 2021, eq. 34; order of pairs as in the reference model, rope_apply(). */
+dar_val *dar_rope(dar_tape *t, dar_val *x, dar_val *table);
+
+/* How the E / 2 pairs of a head are shared between time, height and width: 22, 21, 21 for E = 128. */
+void dar_rope_axes(int64_t e, int64_t pairs[3]);
+
+/* Angles [rad] of the E / 2 pairs of a token at (t, h, w): pair i of an axis with P pairs turns by position
+ * 10000^(-i / P). */
+void dar_rope_angles(int64_t e, const double position[3], double *angle);
+
+/* Fill table [frames height width, E], any float type, for tokens in the order t, h, w, all from 0.  Computed in f64.
+ */
+void dar_rope_table(const dar_tensor *table, int64_t frames, int64_t height, int64_t width);
+
 /* ---------------------------------------------------------------- products */
 
 /* ---------------------------------------------------------------- attention */
