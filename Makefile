@@ -78,18 +78,20 @@ test: deps ## install what is missing, build, run every test; the last line coun
 test-built: $(TESTS:%=$B/%)
 	@scripts/run-tests.sh $B $(TESTS)
 
-$B/bench_kernels: $(BENCH) $B/libdar.a
+$B/bench_kernels: $(BENCH)
+$B/ulp: $B/tests/ulp.o
+$B/bench_kernels $B/ulp: $B/libdar.a
 	@echo "LD $@"
-	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS)
+	@$(CC) -o $@ $(filter %.o,$^) $B/libdar.a $(LDFLAGS) $(LIBS)
 
 # OpenBLAS, the yardstick, runs as it chooses by itself.
 bench-kernels: deps ## speed of every kernel as a fraction of the machine's peak: table, build/bench/kernels.csv
 	@$(MAKE) --no-print-directory $B/bench_kernels
 	@mkdir -p build/bench
-	@env -u OPENBLAS_CORETYPE -u OPENBLAS_L2_SIZE $B/bench_kernels build/bench/kernels.csv \
-		$(if $(QUICK),quick) $(if $(FILTER),'filter=$(FILTER)') $(if $(CPU),cpu=$(CPU))
+	@env -u OPENBLAS_CORETYPE -u OPENBLAS_L2_SIZE $B/bench_kernels --output=build/bench/kernels.csv \
+		$(if $(QUICK),--quick) $(if $(FILTER),'--filter=$(FILTER)') $(if $(CPU),--cpu-mask=$(CPU))
 
-everything: all $(TESTS:%=$B/%) $B/bench_kernels
+everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/ulp
 
 headers: $(HDR:%=alone/%)
 
@@ -105,10 +107,6 @@ check: ## lint, then gcc, clang, debug and sanitizer builds, tests in release an
 stress: deps ## where numbers break: tests/test_stress.c, with the tests that take gigabytes of memory
 	@$(MAKE) --no-print-directory $B/test_stress
 	@$B/test_stress full
-
-$B/ulp: $B/tests/ulp.o $B/libdar.a
-	@echo "LD $@"
-	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS)
 
 ulp: ## exp, tanh, rsqrt, silu at all 2^32 arguments against f64, at every CPU level; a few minutes
 	@$(MAKE) --no-print-directory $B/ulp

@@ -1,11 +1,8 @@
-/* bench_kernels.c: how fast the kernels are, as fractions of what the machine can do in the same seconds.
- *
- *   bench_kernels CSV [quick] [filter=TEXT] [cpu=MASK]
- *
- * Prints a table and writes the CSV file.  quick: shorter, without the largest rows, all threads only.  filter: rows
- * whose "kernel dtype shape" contains TEXT.  cpu: as --cpu-mask. */
+/* bench_kernels.c: how fast the kernels are, as fractions of what the machine can do in the same seconds.  Prints a
+ * table and writes it as CSV. */
 #include "tests/bench.h"
 
+#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -13,6 +10,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "lib/args.h"
 #include "lib/cpu.h"
 #include "lib/kern.h"
 #include "lib/status.h"
@@ -375,7 +373,7 @@ static void report_peaks(int threads_all)
     }
 }
 
-int main(int argc, char **argv)
+static void run_all(const char *filter, bool quickly, dar_arena *arena)
 {
     static const struct {
         const bench_row *rows;
@@ -385,43 +383,83 @@ int main(int argc, char **argv)
         { bench_op_rows, &bench_n_op_rows },
         { bench_row_rows, &bench_n_row_rows },
     };
-    const struct options *o = &full;
-    const char *filter = "";
-    unsigned cpu = DAR_CPU_ALL;
-    dar_arena arena;
-    dar_err e;
-    double begin = now(), all, own, all_end, own_end;
+    int threads = dar_threads();
 
-    busy_time(&all, &own);
-    for (int i = 2; i < argc; i++) {
-        if (strcmp(argv[i], "quick") == 0) o = &quick;
-        else if (strncmp(argv[i], "filter=", 7) == 0) filter = argv[i] + 7;
-        else if (strncmp(argv[i], "cpu=", 4) != 0 || dar_cpu_parse(argv[i] + 4, &cpu, &e) != DAR_OK) argc = 0;
-    }
-    if (argc < 2) {
-        fprintf(stderr, "usage: bench_kernels CSV [quick] [filter=TEXT] [cpu=none|avx2|avx512|bf16|vnni|all]\n");
-        return 2;
-    }
-    if (!(csv = fopen(argv[1], "w")) || dar_arena_init(&arena, "bench", ARENA_BYTES, &e) != DAR_OK) {
-        fprintf(stderr, "bench_kernels: %s: %s\n", argv[1], csv ? e.text : "cannot write");
-        return 3;
-    }
-    dar_cpu_init(cpu);
-    int threads_all = dar_threads();
     fprintf(csv, "kernel,dtype,shape,threads,median_s,gflops,gbps,fraction_of_peak,vs_openblas\n");
-    report_peaks(threads_all);
+    report_peaks(threads);
     printf("OpenBLAS: %s\n\n%-18s %-4s %-16s %2s %10s %8s %7s %6s %6s\n", bench_blas_core(), "kernel", "type", "shape",
            "th", "ms", "GF/s", "GB/s", "peak", "blas");
     for (size_t t = 0; t < DAR_COUNT(tables); t++)
         for (size_t i = 0; i < *tables[t].n; i++)
-            if (wanted(&tables[t].rows[i], filter)) run_row(&tables[t].rows[i], o, &arena, threads_all);
+            if (wanted(&tables[t].rows[i], filter))
+                run_row(&tables[t].rows[i], quickly ? &quick : &full, arena, threads);
 
     printf("\n%d of %d bars met", tally.met, tally.bars);
     if (tally.scaling)
-        printf("; %d threads %.2f times one or more in %d of %d rows, at least %.2f (%s)", threads_all,
-               SCALING * threads_all, tally.scaling_met, tally.scaling, tally.least, tally.least_row);
-    printf("; %.0f s\n", now() - begin);
+        printf("; %d threads %.2f times one or more in %d of %d rows, at least %.2f (%s)", threads, SCALING * threads,
+               tally.scaling_met, tally.scaling, tally.least, tally.least_row);
+}
+
+int main(int argc, char **argv)
+{
+    static const char *filter, *mask, *output;
+    static int64_t threads;
+    static bool quickly;
+    static const dar_option options[] = {
+        { .name = "quick",
+          .type = DAR_ARG_FLAG,
+          .target = &quickly,
+          .help = "shorter, all threads only, without the largest rows" },
+        { .name = "filter",
+          .placeholder = "TEXT",
+          .type = DAR_ARG_TEXT,
+          .target = &filter,
+          .help = "only rows whose kernel, type and shape, in one line, contain TEXT" },
+        { .name = "output",
+          .placeholder = "FILE",
+          .type = DAR_ARG_TEXT,
+          .target = &output,
+          .standard = "build/bench/kernels.csv",
+          .help = "the table as CSV" },
+        { .name = "cpu-mask",
+          .placeholder = "MASK",
+          .type = DAR_ARG_TEXT,
+          .target = &mask,
+          .standard = "all",
+          .help = "none, avx2, avx512, bf16, vnni or all" },
+        { .name = "threads",
+          .placeholder = "N",
+          .type = DAR_ARG_INT,
+          .target = &threads,
+          .standard = "0",
+          .lo = 0,
+          .hi = 1024,
+          .help = "beside one; 0: all processors" },
+    };
+    dar_program p = { .name = "bench_kernels",
+                      .summary = "Measure kernels as fractions of the machine's peak.",
+                      .options = options,
+                      .n_options = DAR_COUNT(options) };
+    dar_arena arena = { 0 };
+    dar_err e;
+    unsigned cpu = 0;
+    double begin = now(), all, own, all_end, own_end;
+
+    dar_status s = dar_args_parse(&p, argc, argv, &e);
+    if (s == DAR_OK && dar_args_answer(&p, stdout)) return 0;
+    if (s == DAR_OK) s = dar_cpu_parse(mask, &cpu, &e);
+    if (s == DAR_OK) s = dar_arena_init(&arena, "bench", ARENA_BYTES, &e);
+    if (s == DAR_OK && !(csv = fopen(output, "w"))) s = dar_fail(&e, DAR_ERR_IO, "%s: %s", output, strerror(errno));
+    if (s != DAR_OK) {
+        fprintf(stderr, "bench_kernels: %s\n", e.text);
+        return dar_status_exit(s);
+    }
+    dar_cpu_init(cpu);
+    if (threads) dar_threads_set((int)threads);
+    busy_time(&all, &own);
+    run_all(filter ? filter : "", quickly, &arena);
     busy_time(&all_end, &own_end);
+    printf("; %.0f s\n", now() - begin);
     double others = (all_end - all - (own_end - own)) / (now() - begin);
     if (others > NEIGHBOURS)
         printf("Other programs used %.2f processors meanwhile: these figures are too low.\n", others);
