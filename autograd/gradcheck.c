@@ -5,9 +5,9 @@
 #include <math.h>
 #include <string.h>
 
-#define ORDER_DIRECTION 8 /* p: differences of order 2p */
+#define ORDER_DIRECTION 7 /* p: differences of order 2p */
 #define ORDER_ELEMENT   2
-#define STEPS           12 /* steps tried, each a quarter of the one before */
+#define STEPS           22 /* steps tried, each half of the one before */
 
 /* What is evaluated: x = base + s u for every input, or for one element of one input. */
 struct probe {
@@ -180,18 +180,18 @@ static void random_cotangent(struct probe *p, uint64_t seed)
 /* The step for directions: the one whose two orders agree best, with the share of rounding that they cannot see. */
 static double choose_step(struct probe *p)
 {
-    double size = 1, best = INFINITY, step = 0;
+    double size = 1, best = INFINITY, last = INFINITY, step = 0;
     for (int i = 0; i < p->c->n; i++)
         if (!is_frozen(p, i)) size = fmax(size, p->size[i]);
     double h = first_step(p, ORDER_DIRECTION, size);
-    for (int k = 0, worse = 0; k < STEPS && worse < 3; k++, h /= 4) {
+    for (int k = 0; k < STEPS && !(best <= 1e-12 * p->weight && last > best); k++, h /= 2) {
         double e = 2 * DBL_EPSILON * p->weight / h;
         for (uint64_t trial = 0; trial < 2; trial++) {
             random_direction(p, p->c->seed + 77 + trial, -1);
             e += derivative(p, ORDER_DIRECTION, h, NULL).error;
         }
-        if (e < best) best = e, step = h, worse = 0;
-        else if (step > 0) worse++;
+        if (e < best) best = e, step = h;
+        last = e;
     }
     return step;
 }

@@ -10,6 +10,16 @@
 
 /* ---------------------------------------------------------------- arithmetic */
 
+/* a + b, a - b, a b.  Either side repeats along dimensions in which it is 1 or that it lacks; shapes are aligned at the
+ * last dimension, as in numpy.  The gradient of a side that repeats is summed.  Stored as a. */
+dar_val *dar_add(dar_tape *t, dar_val *a, dar_val *b);
+dar_val *dar_sub(dar_tape *t, dar_val *a, dar_val *b);
+dar_val *dar_mul(dar_tape *t, dar_val *a, dar_val *b);
+
+/* a x + b and a x with constants a, b. */
+dar_val *dar_affine(dar_tape *t, dar_val *x, double a, double b);
+dar_val *dar_scale(dar_tape *t, dar_val *x, double a);
+
 /* ---------------------------------------------------------------- activations */
 
 /* y = x sigmoid(x), elementwise.  Source: Elfwing et al. 2018, eq. 4. */
@@ -200,5 +210,23 @@ dar_val *dar_concat(dar_tape *t, dar_val *const *x, int n, int dim);
 dar_val *dar_pad(dar_tape *t, dar_val *x, const int64_t *before, const int64_t *after);
 
 /* ---------------------------------------------------------------- reductions */
+
+#define DAR_ALL_DIMS (~0u)
+
+/* Sum and mean over the dimensions whose bits are set in dims (1u << 0 is the first).  keep: they stay as 1, else they
+ * go.  y is f32, or f64 where x is; sums are formed in f64 but for at most 32 neighbours. */
+dar_val *dar_sum(dar_tape *t, dar_val *x, unsigned dims, bool keep);
+dar_val *dar_mean(dar_tape *t, dar_val *x, unsigned dims, bool keep);
+
+/* y = sum w (x - target)^2, or with as_mean that divided by the number of elements of x (not by the sum of w).
+ *
+ *   x, target   of one shape
+ *   w           broadcasts to it; frozen; NULL: 1
+ *   y           scalar, f32, or f64 where x is; summed in f64 */
+dar_val *dar_squared_error(dar_tape *t, dar_val *x, dar_val *target, dar_val *w, bool as_mean);
+
+/* y = exp(x + mask) / sum of it, along the last dimension.  mask broadcasts to x's shape; frozen; NULL: 0.  A row that
+ * is -inf throughout gives zeros and zero gradients. */
+dar_val *dar_softmax(dar_tape *t, dar_val *x, dar_val *mask);
 
 #endif

@@ -2,6 +2,9 @@
 # run-tests.sh BUILD TEST...: run every test program, keep its output in BUILD/TEST.log, print failures, skips and the
 # programs' own "note:" lines, then the totals.  Fails if a program fails or if the number of skips is not
 # EXPECTED_SKIPS (default 0).
+#
+# Idle threads sleep: programs that ask for more threads than there are processors, as tests do, else spin for nothing.
+export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive}
 build=$1
 shift
 passed=0 failed=0 skipped=0 bad=0
