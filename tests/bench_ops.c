@@ -80,6 +80,49 @@ static const bench_kind rms_norm = { BENCH_OP(rms_norm), .inputs = tokens_weight
 static const bench_kind layer_norm = { BENCH_OP(layer_norm), .inputs = tokens_weight_bias, .call = call_layer_norm };
 static const bench_kind modulate = { BENCH_OP(modulate), .inputs = tokens_rows, .call = call_modulate };
 
+static void residual(bench *b)
+{
+    for (int i = 0; i < 2; i++) bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1]), true);
+    bench_input(b, DAR_F32, DAR_SHAPE(1, 2, b->s[1]), true);
+}
+
+static dar_val *call_gate(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_gate(t, x[0], x[1], x[2], norm_opt.split);
+}
+
+/* Channels, height, width. */
+static void picture(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1], b->s[2]), true);
+    bench_input(b, DAR_F32, DAR_SHAPE(b->s[0]), true);
+}
+
+static dar_val *call_channel_norm(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_channel_norm(t, x[0], x[1]);
+}
+
+/* Tokens, heads, head size. */
+static void tokens_angles(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1] * b->s[2]), true);
+    bench_input(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[2]), false);
+    dar_rope_table(&b->x[1], b->s[0] / 512, 16, 32);
+}
+
+static dar_val *call_rope(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_rope(t, x[0], x[1]);
+}
+
+static const bench_kind gate = { BENCH_OP(gate), .inputs = residual, .call = call_gate };
+static const bench_kind channel_norm = { BENCH_OP(channel_norm), .inputs = picture, .call = call_channel_norm };
+static const bench_kind rope = { BENCH_OP(rope), .inputs = tokens_angles, .call = call_rope };
+
 /* ---------------------------------------------------------------- shape: heads to the front, a slice, a concatenation
  */
 
@@ -198,6 +241,9 @@ const bench_row bench_op_rows[] = {
     STREAM(rms_norm, 8192, 3072),
     STREAM(layer_norm, 8192, 3072),
     STREAM(modulate, 8192, 3072),
+    STREAM(gate, 8192, 3072),
+    STREAM(channel_norm, 256, 256, 448),
+    STREAM(rope, 8192, 24, 128),
     STREAM(silu, 8192, 3072),
     STREAM(gelu_tanh, 8192, 3072),
     STREAM(relu, 8192, 3072),

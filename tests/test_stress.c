@@ -313,6 +313,47 @@ static void norms_of_nothing(void **state)
         check_all("RMS norm of a constant row", &y->x, value[k] / size, 0x1p-22);
         sweep(y); /* 1/r - x^2/r^3 = eps/r^3 for equal x */
         check_all("gradient of RMS norm", &in->g, 1e-6 / (size * size * size), 0x1p-20 / size);
+
+        float w[D];
+        for (int i = 0; i < D; i++) w[i] = 1;
+        in = leaf(DAR_SHAPE(1, D, 1), x, true);
+        y = dar_channel_norm(&tape, in, leaf(DAR_SHAPE(D), w, true));
+        check_all("channel norm of a constant row", &y->x, value[k] / fmax(fabs(value[k]), 1e-12 / sqrt(D)), 0x1p-21);
+        sweep(y);
+        for (size_t i = 0; i < D; i++) CHECK(isfinite(at(&in->g, i)), "gradient of channel norm at %g", value[k]);
+    }
+}
+
+/* ---------------------------------------------------------------- positions */
+
+/* A frame far into a clip, rows and columns of a large picture; heads whose pairs do not divide by three. */
+static void positions_stay_exact(void **state)
+{
+    (void)state;
+    static const int64_t sizes[] = { 128, 64, 10, 2 };
+    static const int64_t last[3] = { 1024, 3, 5 }; /* frames, rows, columns */
+    for (size_t k = 0; k < DAR_COUNT(sizes); k++) {
+        int64_t E = sizes[k], pairs[3], N = last[0] * last[1] * last[2];
+        setup(NULL);
+        dar_rope_axes(E, pairs);
+        assert_int_equal(pairs[0] + pairs[1] + pairs[2], E / 2);
+        if (E == 128) assert_true(pairs[0] == 22 && pairs[1] == 21 && pairs[2] == 21);
+
+        dar_tensor table = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(N, E)),
+                   x = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(1, N, E));
+        dar_rope_table(&table, last[0], last[1], last[2]);
+        dar_tensor_fill(&x, 0);
+        float *v = x.data;
+        for (int64_t i = 0; i < E; i += 2) v[(N - 1) * E + i] = 1; /* turns into (cos, sin) */
+        dar_val *y = dar_rope(&tape, dar_leaf(&tape, x, NULL), dar_leaf(&tape, table, NULL));
+        int64_t i = 0;
+        for (int axis = 0; axis < 3; axis++)
+            for (int64_t p = 0; p < pairs[axis]; p++, i++) {
+                long double a = (long double)(last[axis] - 1) * powl(10000, -(long double)p / (long double)pairs[axis]);
+                size_t at_pair = (size_t)((N - 1) * E + 2 * i);
+                CHECK_NEAR("cos", at(&y->x, at_pair), (double)cosl(a), 0x1p-24);
+                CHECK_NEAR("sin", at(&y->x, at_pair + 1), (double)sinl(a), 0x1p-24);
+            }
     }
 }
 
@@ -601,21 +642,14 @@ static void long_sums_keep_digits(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test_setup(flags_keep_arithmetic, setup),
-        cmocka_unit_test_setup(denormals_survive, setup),
-        cmocka_unit_test_setup(bad_numbers_are_named, setup),
-        cmocka_unit_test_setup(long_sums_keep_digits, setup),
-        cmocka_unit_test_setup(logits_of_ten_thousand, setup),
-        cmocka_unit_test_setup(masked_rows_are_zero, setup),
-        cmocka_unit_test_setup(equal_keys_fold, setup),
-        cmocka_unit_test_setup(norms_far_from_zero, setup),
-        cmocka_unit_test_setup(norms_of_nothing, setup),
-        cmocka_unit_test_setup(tails_stay_relative, setup),
-        cmocka_unit_test_setup(adamw_corners, setup),
-        cmocka_unit_test_setup(views_reach_beyond_int, setup),
-        cmocka_unit_test_setup(products_reach_beyond_int, setup),
-        cmocka_unit_test_setup(scans_reach_beyond_int, setup),
-        cmocka_unit_test_setup(plans_count_beyond_int, setup),
+        cmocka_unit_test_setup(flags_keep_arithmetic, setup),  cmocka_unit_test_setup(denormals_survive, setup),
+        cmocka_unit_test_setup(bad_numbers_are_named, setup),  cmocka_unit_test_setup(long_sums_keep_digits, setup),
+        cmocka_unit_test_setup(logits_of_ten_thousand, setup), cmocka_unit_test_setup(masked_rows_are_zero, setup),
+        cmocka_unit_test_setup(equal_keys_fold, setup),        cmocka_unit_test_setup(norms_far_from_zero, setup),
+        cmocka_unit_test_setup(norms_of_nothing, setup),       cmocka_unit_test_setup(positions_stay_exact, setup),
+        cmocka_unit_test_setup(tails_stay_relative, setup),    cmocka_unit_test_setup(adamw_corners, setup),
+        cmocka_unit_test_setup(views_reach_beyond_int, setup), cmocka_unit_test_setup(products_reach_beyond_int, setup),
+        cmocka_unit_test_setup(scans_reach_beyond_int, setup), cmocka_unit_test_setup(plans_count_beyond_int, setup),
         cmocka_unit_test_setup(sizes_do_not_wrap, setup),
     };
     const struct CMUnitTest large[] = {
