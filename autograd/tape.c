@@ -68,6 +68,11 @@ static void *push_meta(dar_tape *t, size_t bytes)
     return memset(dar_arena_push(&t->meta, bytes), 0, bytes);
 }
 
+void *dar_tape_store(dar_tape *t, const void *data, size_t bytes)
+{
+    return memcpy(dar_arena_push(&t->meta, bytes), data, bytes);
+}
+
 static dar_val *push_val(dar_tape *t, dar_tensor x)
 {
     dar_val *v = push_meta(t, sizeof *v);
@@ -182,8 +187,7 @@ static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool sav
 static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val *const *in, int n, dar_val *y)
 {
     dar_node *node = push_meta(t, sizeof *node);
-    void *attr = op->attr_size ? dar_arena_push(&t->meta, op->attr_size) : NULL;
-    if (attr) memcpy(attr, c->attr, op->attr_size);
+    void *attr = op->attr_size ? dar_tape_store(t, c->attr, op->attr_size) : NULL;
     *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = attr, .aux = c->aux };
     memcpy(node->in, in, (size_t)n * sizeof *in);
     t->last = node;

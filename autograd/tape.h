@@ -72,6 +72,9 @@ dar_val *dar_leaf(dar_tape *t, dar_tensor x, const dar_tensor *g);
 /* A leaf without memory of its own: x is pushed, content undefined (planning: only counted). */
 dar_val *dar_input(dar_tape *t, dar_dtype type, dar_shape s);
 
+/* A copy of `bytes` that lives as long as the values made now: arguments of segments. */
+void *dar_tape_store(dar_tape *t, const void *data, size_t bytes);
+
 /* Run op on n inputs (NULL: absent).  attr is copied.  Inputs that are strided views are copied to contiguous memory
  * first. */
 dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr);
