@@ -48,9 +48,9 @@ typedef struct dar_kern {
     void (*get[DAR_DTYPES])(size_t n, const void *src, void *x);
     void (*put[DAR_DTYPES])(size_t n, const void *x, void *dst, bool stream);
 
-    /* y = f(x).  exp, tanh, rsqrt, silu: bound 2 ULP for every argument, exact for NaN, infinities and -0 (silu: its
-     * limits).  gelu_tanh: bound (2 |z| + 5) 2^-24 relative, z = 2 sqrt(2/pi) (x + 0.044715 x^3).  "_back": gx =
-     * f'(x) gy. */
+    /* y = f(x).  exp, tanh, rsqrt: bound 2 ULP for every argument; silu: 2.5; exact for NaN, infinities (silu: its
+     * limits) and zeros with their sign.  gelu_tanh: bound (5 |z| + 5) 2^-24 relative, z = 2 sqrt(2/pi)
+     * (x + 0.044715 x^3).  "_back": gx = f'(x) gy. */
     dar_kern_map *exp, *tanh, *rsqrt, *silu, *gelu_tanh, *relu;
     dar_kern_map_back *silu_back, *gelu_tanh_back, *relu_back;
 
