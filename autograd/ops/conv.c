@@ -45,10 +45,10 @@ static dar_conv geometry(const dar_shape *in, const dar_conv_attr *a)
                    .kh = (size_t)w.d[3],
                    .kw = (size_t)w.d[4],
                    .stride = (size_t)a->stride,
-                   .top = (size_t)a->top,
-                   .left = (size_t)a->left,
+                   .top = a->top,
+                   .left = a->left,
                    .stride_t = clip ? (size_t)a->stride_t : 1,
-                   .front = clip ? (size_t)a->front : 0 };
+                   .front = clip ? a->front : 0 };
     if (clip && in[HISTORY].n >= 0) {
         const dar_shape *h = &in[HISTORY];
         DAR_ASSERT(h->n == 5 && h->d[0] == x.d[0] && h->d[1] == x.d[1] && h->d[3] == x.d[3] && h->d[4] == x.d[4] &&
@@ -77,18 +77,28 @@ static dar_shape out_shape(const dar_shape *in, const dar_conv_attr *a)
     return DAR_SHAPE(d[0], d[1], d[3], d[4]);
 }
 
-static size_t scratch(const dar_opctx *c, bool backward)
+/* For the gradients of x and history: without the frames of a history that wants none. */
+static dar_conv geometry_back_x(const dar_opctx *c)
 {
     dar_conv g = geometry_of(c);
-    size_t most = 0, n;
-    for (dar_conv_pass p = backward ? DAR_CONV_BACK_X : DAR_CONV_FORWARD;
-         p <= (backward ? DAR_CONV_BACK_W : DAR_CONV_FORWARD); p++) {
-        if (p == DAR_CONV_BACK_X && !c->gx[X].data && !c->gx[HISTORY].data) continue;
-        if (p == DAR_CONV_BACK_W && !c->gx[WEIGHT].data) continue;
-        n = dar_conv_scratch(&g, p, c->x[X].dtype, c->x[WEIGHT].dtype, c->threads);
-        if (n > most) most = n;
-    }
-    return most;
+    if (!c->gx[HISTORY].data) g.past = 0;
+    return g;
+}
+
+static bool wants_back_x(const dar_opctx *c)
+{
+    return c->gx[X].data || c->gx[HISTORY].data;
+}
+
+static size_t scratch(const dar_opctx *c, bool backward)
+{
+    dar_conv g = geometry_of(c), gx = geometry_back_x(c);
+    dar_dtype x = c->x[X].dtype, w = c->x[WEIGHT].dtype;
+    if (!backward) return dar_conv_scratch(&g, DAR_CONV_FORWARD, x, w, c->threads);
+
+    size_t bytes[] = { wants_back_x(c) ? dar_conv_scratch(&gx, DAR_CONV_BACK_X, x, w, c->threads) : 0,
+                       c->gx[WEIGHT].data ? dar_conv_scratch(&g, DAR_CONV_BACK_W, x, w, c->threads) : 0 };
+    return bytes[0] > bytes[1] ? bytes[0] : bytes[1];
 }
 
 static double flops(const dar_opctx *c, bool backward)
@@ -97,7 +107,7 @@ static double flops(const dar_opctx *c, bool backward)
     double one = 2.0 * (double)g.B * (double)g.Cout * (double)g.Cin * (double)(g.kt * g.kh * g.kw) *
                  (double)(g.To * g.Ho * g.Wo);
     if (!backward) return one;
-    return one * ((c->gx[X].data || c->gx[HISTORY].data) + (c->gx[WEIGHT].data != NULL));
+    return one * (wants_back_x(c) + (c->gx[WEIGHT].data != NULL));
 }
 
 static double terms(const dar_shape *in, int n_in, const void *attr, int of)
@@ -113,20 +123,18 @@ static double terms(const dar_shape *in, int n_in, const void *attr, int of)
 static void forward(const dar_opctx *c)
 {
     dar_conv g = geometry_of(c);
-    dar_conv_forward(&g, &c->x[X], &c->x[WEIGHT], &c->x[BIAS], &c->x[HISTORY], &c->y, c->scratch, c->threads);
+    dar_conv_forward(&g, &c->x[X], &c->x[WEIGHT], &c->x[BIAS], &c->x[HISTORY], &c->y, c->scratch);
 }
 
 static void backward(const dar_opctx *c)
 {
-    dar_conv g = geometry_of(c);
+    dar_conv g = geometry_of(c), gx = geometry_back_x(c);
     const dar_tensor *x = &c->x[X], *w = &c->x[WEIGHT];
 
-    if (c->gx[X].data || c->gx[HISTORY].data)
-        dar_conv_back_x(&g, x->dtype, w, &c->gy, &c->gx[X], c->add[X], &c->gx[HISTORY], c->add[HISTORY], c->scratch,
-                        c->threads);
+    if (wants_back_x(c))
+        dar_conv_back_x(&gx, x->dtype, w, &c->gy, &c->gx[X], c->add[X], &c->gx[HISTORY], c->add[HISTORY], c->scratch);
     if (c->gx[WEIGHT].data)
-        dar_conv_back_w(&g, x, &c->x[HISTORY], w->dtype, &c->gy, &c->gx[WEIGHT], c->add[WEIGHT], c->scratch,
-                        c->threads);
+        dar_conv_back_w(&g, x, &c->x[HISTORY], w->dtype, &c->gy, &c->gx[WEIGHT], c->add[WEIGHT], c->scratch);
     if (c->gx[BIAS].data) dar_conv_back_b(&g, &c->gy, &c->gx[BIAS], c->add[BIAS]);
 }
 
