@@ -13,6 +13,7 @@
 #define TASKS  16   /* wanted at least, */
 #define LITTLE 96   /* but none with fewer rows: they pay for packing B */
 #define FILL   16   /* rows of col made at a time before they are packed: first-level cache */
+#define BESIDE 16   /* elements between rows of col, so that they do not share their place in the cache */
 #define GROUP  16   /* output channels of w turned at a time; even: whole units */
 #define FLUSH  8192 /* pixels summed in one accumulator before it goes to gw: bounds the error of long sums */
 #define LINE   16   /* columns of gw^T turned at a time: a cache line of f32 */
@@ -114,7 +115,8 @@ static void cut_pixels(struct job *j, dar_dtype w)
     j->depth = DEPTH;
     j->packs_a = j->mirrored || w != j->operand || j->K % t->unit; /* else w is read where it lies */
     if (j->packs_a) j->shared = aligned(blocks_of(Cout, t->mr) * dar_tile_bytes_a(t, j->K));
-    j->col_bytes = aligned(most(FILL * j->n * dar_dtype_size(j->col), t->mr * GROUP * j->taps * dar_dtype_size(w)));
+    j->col_bytes =
+        aligned(most(FILL * (j->n + BESIDE) * dar_dtype_size(j->col), t->mr * GROUP * j->taps * dar_dtype_size(w)));
 }
 
 /* gcol, by channels of x: a task adds to its channels alone. */
@@ -131,7 +133,7 @@ static void cut_channels(struct job *j)
 static void cut_weights(struct job *j)
 {
     j->n = even_block(j->c.Cout, PIXELS, j->tile->nr, 1, 1);
-    j->m = even_block(j->K, ROWS, j->tile->mr, blocks_of(TASKS, blocks_of(j->c.Cout, j->n)), LITTLE);
+    j->m = even_block(j->K, ROWS, j->tile->mr, blocks_of(TASKS, blocks_of(j->c.Cout, j->n)), 2 * LITTLE);
     j->depth = PIXELS;
     j->a_bytes = aligned(j->m * j->depth * dar_dtype_size(j->operand));
     j->col_bytes = aligned(LINE * (j->m + LINE) * dar_dtype_size(j->sum));
@@ -152,7 +154,8 @@ static struct job job_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar
     if (pass == DAR_CONV_FORWARD || j.mirrored) cut_pixels(&j, w);
     else if (pass == DAR_CONV_BACK_X) cut_channels(&j);
     else cut_weights(&j);
-    j.b_bytes = aligned(blocks_of(j.n, j.tile->nr) * dar_tile_bytes_b(j.tile, j.depth));
+    j.b_bytes = aligned((blocks_of(j.n, j.tile->nr) * j.tile->nr + BESIDE) * dar_tile_units(j.tile, j.depth) *
+                        j.tile->unit_bytes);
     j.c_bytes = aligned(j.m * j.n * dar_dtype_size(j.sum));
     return j;
 }
@@ -163,22 +166,33 @@ size_t dar_conv_scratch(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_
     return j.shared + (size_t)threads * own_bytes(&j);
 }
 
-/* A as the tile reads it [units]: unit (i, k) at i row + k step, stripes `stripe` apart. */
+/* Operands as the tile reads them [units]: unit (i, k) of A at i row + k step, unit (k, j) of B at k step + j; stripes
+ * are `stripe` apart. */
 struct lhs {
     const char *data;
     size_t row, step, stripe;
 };
 
-/* c[m, n] (+)= a b over k elements; the stripes of b have room for j->depth. */
-static void multiply(const struct job *j, struct lhs a, const char *b, size_t m, size_t n, size_t k, char *c, bool add)
+struct rhs {
+    const char *data;
+    size_t step, stripe;
+};
+
+static struct rhs packed_rhs(const struct job *j, const char *data)
+{
+    return (struct rhs){ data, j->tile->nr, dar_tile_units(j->tile, j->depth) * j->tile->nr };
+}
+
+/* c[m, n] (+)= a b over k elements. */
+static void multiply(const struct job *j, struct lhs a, struct rhs b, size_t m, size_t n, size_t k, char *c, bool add)
 {
     const dar_tile *t = j->tile;
-    size_t size = dar_dtype_size(j->sum), units = dar_tile_units(t, k), stripe = dar_tile_bytes_b(t, j->depth);
+    size_t size = dar_dtype_size(j->sum), units = dar_tile_units(t, k);
 
     for (size_t i = 0; i < m; i += t->mr, a.data += a.stripe * t->unit_bytes)
         for (size_t q = 0; q < n; q += t->nr)
-            t->mm(units, a.data, a.row, a.step, b + q / t->nr * stripe, t->nr, c + (i * j->n + q) * size, j->n,
-                  least(t->mr, m - i), least(t->nr, n - q), add);
+            t->mm(units, a.data, a.row, a.step, b.data + q / t->nr * b.stripe * t->unit_bytes, b.step,
+                  c + (i * j->n + q) * size, j->n, least(t->mr, m - i), least(t->nr, n - q), add);
 }
 
 /* ---------------------------------------------------------------- rows of col */
@@ -314,6 +328,15 @@ static void fill_rows(const struct job *j, const struct tap *e, struct at p, siz
     }
 }
 
+/* Ask for the same pixels of the next channel: far away in memory, soon wanted. */
+static void ahead(const struct job *j, const struct tap *e, const struct at *p, size_t n, dar_dtype type,
+                  const char *frame)
+{
+    int64_t W = (int64_t)j->c.W, at = ((int64_t)(p->h * j->c.stride) + e->dy) * W + (int64_t)(p->w * j->c.stride);
+    if (at >= 0 && at + (int64_t)n <= (int64_t)j->c.H * W)
+        dar_row_ahead(frame + at * (int64_t)dar_dtype_size(type), n * dar_dtype_size(type));
+}
+
 /* n pixels of a row of col from pixel p. */
 static void fill_row(const struct job *j, const struct tap *e, struct at p, size_t n, const struct clip *v, char *dst)
 {
@@ -324,6 +347,8 @@ static void fill_row(const struct job *j, const struct tap *e, struct at p, size
         m = least(n, (c->Ho - p.h) * c->Wo - p.w);
         dar_dtype type;
         const char *frame = frame_of(v, p.b, e->ci, (int64_t)(p.t * c->stride_t) + e->dt, &type);
+        if (frame && e->dx == 0 && e->ci + 1 < v->C)
+            ahead(j, e, &p, m, type, frame + v->T * v->plane * dar_dtype_size(type));
         if (!frame) zero(dst, m, size);
         else if (c->stride == 1 && c->W == c->Wo) fill_shifted(j, e, p, m, type, frame, dst);
         else fill_rows(j, e, p, m, type, frame, dst);
@@ -369,24 +394,28 @@ struct correlate {
     char *scratch;
 };
 
-/* Stripes of B: rows k0.. of col at pixels q0... */
-static void pack_col(const struct correlate *f, size_t q0, size_t n, size_t k0, size_t k, const struct room *r)
+/* B: rows k0.. of col at pixels q0...  Packed; or, where a unit is one element of col, row by row as they are. */
+static struct rhs make_col(const struct correlate *f, size_t q0, size_t n, size_t k0, size_t k, const struct room *r)
 {
     const struct job *j = &f->j;
     const dar_tile *t = j->tile;
-    size_t size = dar_dtype_size(j->col), stripe = dar_tile_bytes_b(t, j->depth);
+    size_t size = dar_dtype_size(j->col), ld = j->n + BESIDE;
+    struct rhs b = j->col == j->operand && t->unit == 1 ? (struct rhs){ r->b, ld, t->nr } : packed_rhs(j, r->b);
+    bool as_is = b.step == ld;
     struct at p = at_of(&j->c, q0);
 
     for (size_t i = 0; i < k; i += FILL) {
         size_t m = least(FILL, k - i);
+        char *rows = as_is ? r->b + i * ld * size : r->col;
         for (size_t u = 0; u < m; u++) {
             struct tap e = tap_of(j, k0 + i + u);
-            fill_row(j, &e, p, n, &f->in, r->col + u * j->n * size);
+            fill_row(j, &e, p, n, &f->in, rows + u * ld * size);
         }
-        for (size_t q = 0; q < n; q += t->nr)
-            dar_tile_pack_b_kn(t, j->col, r->col + q * size, j->n, m, least(t->nr, n - q),
-                               r->b + q / t->nr * stripe + i / t->unit * t->nr * t->unit_bytes);
+        for (size_t q = 0; q < n && !as_is; q += t->nr)
+            dar_tile_pack_b_kn(t, j->col, rows + q * size, ld, m, least(t->nr, n - q),
+                               r->b + (q / t->nr * b.stripe + i / t->unit * t->nr) * t->unit_bytes);
     }
+    return b;
 }
 
 /* Rows o0.., pixels q0.. of the output = c + b.  A channel's pixels are dense in past and in x. */
@@ -430,8 +459,8 @@ static void correlate_task(void *ctx, size_t i, int thread)
     a.data += o0 / t->mr * a.stripe * t->unit_bytes;
     for (size_t k = 0; k < j->K; k += j->depth) {
         size_t depth = least(j->depth, j->K - k);
-        pack_col(f, q0, n, k, depth, &r);
-        multiply(j, a, r.b, m, n, depth, r.c, k > 0);
+        struct rhs b = make_col(f, q0, n, k, depth, &r);
+        multiply(j, a, b, m, n, depth, r.c, k > 0);
         a.data += depth / t->unit * a.step * t->unit_bytes;
     }
     store(f, o0, m, q0, n, r.c);
@@ -540,7 +569,7 @@ static void back_x_task(void *ctx, size_t i, int thread)
                 dar_tile_pack_b_kn(t, f->gy->dtype, gy + q * gs, j->P, depth, least(t->nr, n - q),
                                    r.b + q / t->nr * dar_tile_bytes_b(t, j->depth));
             struct lhs a = { r.a + o / t->unit * t->mr * t->unit_bytes, 1, t->mr, dar_tile_units(t, Cout) * t->mr };
-            multiply(j, a, r.b, m, n, depth, r.c, o > 0);
+            multiply(j, a, packed_rhs(j, r.b), m, n, depth, r.c, o > 0);
         }
         for (size_t k = 0; k < m; k++) {
             struct tap e = tap_of(j, c0 * j->taps + k);
@@ -593,8 +622,10 @@ static void store_gw(const struct back_w *f, size_t k0, size_t m, size_t o0, siz
     }
 }
 
-/* Rows k0.. of col at n pixels of one batch element, as the tile reads them: whole units, the rest zero. */
-static void fill_col(const struct back_w *f, size_t k0, size_t m, size_t q, size_t n, char *a)
+/* Rows k0.. of col at n pixels of one batch element, as the tile reads them: whole units, the rest zero.  Meanwhile
+ * `rows` of gy are asked for, `bytes` each, for the next pixels. */
+static void fill_col(const struct back_w *f, size_t k0, size_t m, size_t q, size_t n, char *a, const char *gy,
+                     size_t rows, size_t bytes)
 {
     const struct job *j = &f->j;
     size_t size = dar_dtype_size(j->operand), pad = dar_tile_units(j->tile, n) * j->tile->unit - n;
@@ -604,6 +635,7 @@ static void fill_col(const struct back_w *f, size_t k0, size_t m, size_t q, size
         struct tap e = tap_of(j, k0 + k);
         fill_row(j, &e, p, n, &f->x, a);
         zero(a + n * size, pad, size);
+        if (k < rows) dar_row_ahead(gy + k * j->P * dar_dtype_size(f->gy->dtype), bytes);
     }
 }
 
@@ -625,8 +657,9 @@ static void back_w_task(void *ctx, size_t i, int thread)
             for (size_t q = 0; q < n; q += t->nr)
                 dar_tile_pack_b_nk(t, f->gy->dtype, gy + q * j->P * gs, j->P, depth, least(t->nr, n - q),
                                    r.b + q / t->nr * dar_tile_bytes_b(t, j->depth));
-            fill_col(f, k0, m, batch * j->P + p, depth, r.a);
-            multiply(j, a, r.b, m, n, depth, r.c, summed > 0);
+            fill_col(f, k0, m, batch * j->P + p, depth, r.a, gy + depth * gs, n,
+                     least(j->depth, j->P - p - depth) * gs);
+            multiply(j, a, packed_rhs(j, r.b), m, n, depth, r.c, summed > 0);
             summed += depth;
             if (summed < FLUSH && (p + depth < j->P || batch + 1 < j->c.B)) continue;
             store_gw(f, k0, m, o0, n, &r, add);
