@@ -15,15 +15,17 @@ typedef struct pairs {
     __m256i even, odd;
 } bvec, avec;
 
-static inline bvec load_b(const int32_t *p)
+static inline bvec load_b(const void *p)
 {
     __m256i x = _mm256_loadu_si256((const __m256i *)p);
     return (bvec){ _mm256_srai_epi16(_mm256_slli_epi16(x, 8), 8), _mm256_srai_epi16(x, 8) };
 }
 
-static inline avec load_a(const int32_t *p)
+static inline avec load_a(const void *p)
 {
-    __m256i x = _mm256_set1_epi32(*p);
+    int32_t unit;
+    memcpy(&unit, p, sizeof unit);
+    __m256i x = _mm256_set1_epi32(unit);
     return (avec){ _mm256_and_si256(x, _mm256_set1_epi16(255)), _mm256_srli_epi16(x, 8) };
 }
 
