@@ -69,7 +69,7 @@ rule "headers alone" build gcc debug headers
 
 rule "gcc release: build and tests" build gcc release test-built
 rule "exported names" names build/check/gcc-release/libdar.a
-rule "clang release: build" build clang release
+rule "clang release: build and tests" build clang release test-built
 rule "gcc debug: build" build gcc debug
 rule "gcc asan, ubsan: build and tests" build gcc asan test-built
 finish

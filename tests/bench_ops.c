@@ -32,6 +32,65 @@ static const bench_kind silu = { BENCH_OP(silu), .inputs = one, .call = call_sil
 static const bench_kind gelu_tanh = { BENCH_OP(gelu_tanh), .inputs = one, .call = call_gelu_tanh };
 static const bench_kind relu = { BENCH_OP(relu), .inputs = one, .call = call_relu };
 
+static void two(bench *b)
+{
+    one(b);
+    one(b);
+}
+
+static dar_val *call_add(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_add(t, x[0], x[1]);
+}
+
+static dar_val *call_mul(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_mul(t, x[0], x[1]);
+}
+
+static dar_val *call_affine(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_affine(t, x[0], 0.7, 0.3);
+}
+
+static const bench_kind add = { BENCH_OP(add), .inputs = two, .call = call_add };
+static const bench_kind mul = { BENCH_OP(mul), .inputs = two, .call = call_mul };
+static const bench_kind affine = { BENCH_OP(affine), .inputs = one, .call = call_affine };
+
+/* ---------------------------------------------------------------- reductions */
+
+static dar_val *call_softmax(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_softmax(t, x[0], NULL);
+}
+
+static dar_val *call_mean(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_mean(t, x[0], DAR_ALL_DIMS, false);
+}
+
+static void prediction_target(bench *b)
+{
+    one(b);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[0], b->s[1]), false);
+}
+
+static dar_val *call_squared_error(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_squared_error(t, x[0], x[1], NULL, true);
+}
+
+static const bench_kind softmax = { BENCH_OP(softmax), .inputs = one, .call = call_softmax };
+static const bench_kind mean = { BENCH_OP(mean), .inputs = one, .call = call_mean };
+static const bench_kind squared_error = { BENCH_OP(squared_error), .inputs = prediction_target,
+                                          .call = call_squared_error };
+
 /* ---------------------------------------------------------------- norms: tokens, width */
 
 static void tokens_and_vectors(bench *b, int vectors)
@@ -206,7 +265,6 @@ static const bench_kind conv3d = { BENCH_OP(conv3d), .inputs = clip, .call = cal
 
 /* ---------------------------------------------------------------- rows */
 
-#define MEMORY BENCH_COPY, { 0.8, 0.8 }, false
 #define ATTN(...)                                                                                                      \
     { &attention, DAR_F32, { __VA_ARGS__ }, BENCH_F32, { 0.80, 0.68 }, false },                                        \
     {                                                                                                                  \
@@ -218,12 +276,14 @@ static const bench_kind conv3d = { BENCH_OP(conv3d), .inputs = clip, .call = cal
         &kind, DAR_BF16, { __VA_ARGS__ }, BENCH_BF16, { 0.70, 0.70 }, false                                            \
     }
 
-/* Larger than the caches, in the two types that networks use. */
-#define STREAM(kind, ...)                                                                                              \
-    { &kind, DAR_F32, { __VA_ARGS__ }, MEMORY },                                                                       \
+/* Larger than the caches, in the two types that networks use; PLAIN: without a bar. */
+#define BOTH(kind, bar, ...)                                                                                           \
+    { &kind, DAR_F32, { __VA_ARGS__ }, BENCH_COPY, { bar, bar }, false },                                              \
     {                                                                                                                  \
-        &kind, DAR_BF16, { __VA_ARGS__ }, MEMORY                                                                       \
+        &kind, DAR_BF16, { __VA_ARGS__ }, BENCH_COPY, { bar, bar }, false                                              \
     }
+#define STREAM(kind, ...) BOTH(kind, 0.8, __VA_ARGS__)
+#define PLAIN(kind, ...)  BOTH(kind, 0, __VA_ARGS__)
 
 const bench_row bench_op_rows[] = {
     ATTN(1536, 6, 64),
@@ -247,7 +307,13 @@ const bench_row bench_op_rows[] = {
     STREAM(silu, 8192, 3072),
     STREAM(gelu_tanh, 8192, 3072),
     STREAM(relu, 8192, 3072),
-    STREAM(permute, 8192, 24, 128),
-    STREAM(transpose, 8192, 3072),
+    PLAIN(add, 8192, 3072),
+    PLAIN(mul, 8192, 3072),
+    PLAIN(affine, 8192, 3072),
+    PLAIN(softmax, 8192, 3072),
+    PLAIN(mean, 8192, 3072),
+    PLAIN(squared_error, 8192, 3072),
+    PLAIN(permute, 8192, 24, 128),
+    PLAIN(transpose, 8192, 3072),
 };
 const size_t bench_n_op_rows = DAR_COUNT(bench_op_rows);

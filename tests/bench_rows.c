@@ -103,18 +103,16 @@ static const bench_kind adamw = { .part = { "adamw" }, .setup = setup_adamw, .ru
 
 /* ---------------------------------------------------------------- rows */
 
-#define MEMORY BENCH_COPY, { 0.8 }, false
+#define ROW(kind, type, peak, bar)                                                                                     \
+    {                                                                                                                  \
+        &kind, type, { 8192, 3072 }, peak, { bar }, false                                                              \
+    }
 
 const bench_row bench_row_rows[] = {
-    { &from_f32, DAR_F32, { 8192, 3072 }, MEMORY },
-    { &from_f32, DAR_BF16, { 8192, 3072 }, MEMORY },
-    { &from_f32, DAR_F16, { 8192, 3072 }, MEMORY },
-    { &to_f32, DAR_BF16, { 8192, 3072 }, MEMORY },
-    { &to_f32, DAR_F16, { 8192, 3072 }, MEMORY },
-    { &quantise, DAR_F32, { 8192, 3072 }, MEMORY },
-    { &quantise, DAR_BF16, { 8192, 3072 }, MEMORY },
-    { &nonfinite, DAR_F32, { 8192, 3072 }, BENCH_READ, { 0.8 }, false },
-    { &nonfinite, DAR_BF16, { 8192, 3072 }, BENCH_READ, { 0.8 }, false },
-    { &adamw, DAR_F32, { 8192, 3072 }, MEMORY },
+    ROW(from_f32, DAR_F32, BENCH_COPY, 0),   ROW(from_f32, DAR_BF16, BENCH_COPY, 0),
+    ROW(from_f32, DAR_F16, BENCH_COPY, 0),   ROW(to_f32, DAR_BF16, BENCH_COPY, 0),
+    ROW(to_f32, DAR_F16, BENCH_COPY, 0),     ROW(quantise, DAR_F32, BENCH_COPY, 0),
+    ROW(quantise, DAR_BF16, BENCH_COPY, 0),  ROW(nonfinite, DAR_F32, BENCH_READ, 0),
+    ROW(nonfinite, DAR_BF16, BENCH_READ, 0), ROW(adamw, DAR_F32, BENCH_COPY, 0.8),
 };
 const size_t bench_n_row_rows = DAR_COUNT(bench_row_rows);

@@ -264,6 +264,33 @@ static void equal_keys_fold(void **state)
     check_all("gradient of q, one key", &x[0]->g, 0, 1e-5);
 }
 
+/* The same as an op of its own. */
+static void softmax_alone(void **state)
+{
+    (void)state;
+    enum { N = 513 };
+    float x[N];
+    for (int i = 0; i < N; i++) x[i] = i % 2 ? -1e4f : 1e4f - 200;
+    x[0] = x[100] = 1e4f;
+    dar_val *in = leaf(DAR_SHAPE(1, N), x, true), *y = dar_softmax(&tape, in, NULL);
+    for (size_t i = 0; i < N; i++) CHECK_NEAR("logits of 1e4", at(&y->x, i), i == 0 || i == 100 ? 0.5 : 0, 0x1p-149);
+    sweep(y); /* the sum of a softmax does not move */
+    check_all("gradient of ones", &in->g, 0, 0x1p-22);
+
+    for (int i = 0; i < N; i++) x[i] = 88;
+    y = dar_softmax(&tape, leaf(DAR_SHAPE(1, 512), x, false), NULL);
+    check_all("512 equal logits", &y->x, 1.0 / 512, 0);
+
+    for (int i = 0; i < N; i++) x[i] = -INFINITY;
+    in = leaf(DAR_SHAPE(1, N), x, true);
+    y = dar_softmax(&tape, in, NULL);
+    check_all("masked row", &y->x, 0, 0);
+    sweep(y);
+    check_all("gradient of a masked row", &in->g, 0, 0);
+    y = dar_softmax(&tape, leaf(DAR_SHAPE(3, 1), (float[]){ -1e4f, 0, 3e38f }, false), NULL);
+    check_all("one key", &y->x, 1, 0);
+}
+
 /* ---------------------------------------------------------------- norms */
 
 /* 1e4 + tiny: the mean has all the digits that x has, the spread a few of the last. */
@@ -599,42 +626,40 @@ static void sizes_do_not_wrap(void **state)
 
 /* ---------------------------------------------------------------- sums */
 
-struct squares {
-    const float *x;
-};
-
-static double square_sum(void *ctx, size_t begin, size_t end)
-{
-    const struct squares *s = ctx;
-    double sum = 0;
-    for (size_t i = begin; i < end; i++) sum += (double)s->x[i] * s->x[i];
-    return sum;
-}
-
-/* Four million squares, among them a thousand large ones: a running f32 sum loses the small ones beside them. */
+/* Of four million squares, among them a thousand large ones: a running f32 sum loses the small ones beside them. */
 static void long_sums_keep_digits(void **state)
 {
     (void)state;
-    size_t n = (size_t)4200000;
-    dar_tensor x = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE((int64_t)n));
+    enum { N = 4200000 };
+    dar_tensor x = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(N)),
+               zero = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(N));
     float *v = x.data, naive = 0;
-    long double exact = 0;
-    for (size_t i = 0; i < n; i++) {
+    long double exact[3] = { 0 };
+    dar_tensor_fill(&zero, 0);
+    for (size_t i = 0; i < N; i++) {
         v[i] = i % 4096 ? sinf((float)(i % 100003) * 0.7f) : 1000;
-        exact += (long double)v[i] * v[i];
         naive += v[i] * v[i];
+        exact[0] += v[i];
+        exact[1] += v[i] / (long double)N;
+        exact[2] += (long double)v[i] * v[i];
     }
-    CHECK(fabsl(naive - exact) > 1e-4L * exact, "the sample is too easy: a running f32 sum has it right");
+    CHECK(fabsl(naive - exact[2]) > 1e-4L * exact[2], "the sample is too easy: a running f32 sum has it right");
 
     int before = dar_threads();
     static const int threads[] = { 1, 2, 3, 7 };
-    double first = 0;
+    static const char *const name[3] = { "sum", "mean", "squared_error" };
+    double first[3] = { 0 };
     for (size_t k = 0; k < DAR_COUNT(threads); k++) {
         dar_threads_set(threads[k]);
-        double sum = dar_parallel_sum(n, 4096, square_sum, &(struct squares){ v });
-        if (!k) first = sum;
-        CHECK_NEAR("sum of squares", sum, (double)exact, 1e-7 * (double)exact);
-        CHECK(memcmp(&sum, &first, sizeof sum) == 0, "%.17g with %d threads, %.17g with 1", sum, threads[k], first);
+        dar_val *in = dar_leaf(&tape, x, NULL);
+        double y[3] = { at(&dar_sum(&tape, in, DAR_ALL_DIMS, false)->x, 0),
+                        at(&dar_mean(&tape, in, DAR_ALL_DIMS, false)->x, 0),
+                        at(&dar_squared_error(&tape, in, dar_leaf(&tape, zero, NULL), NULL, false)->x, 0) };
+        for (int i = 0; i < 3; i++) {
+            if (!k) first[i] = y[i];
+            CHECK_NEAR(name[i], y[i], (double)exact[i], 1e-7 * fabs((double)exact[i]));
+            CHECK(y[i] == first[i], "%s: %.9g with %d threads, %.9g with 1", name[i], y[i], threads[k], first[i]);
+        }
     }
     dar_threads_set(before);
 }
@@ -642,14 +667,23 @@ static void long_sums_keep_digits(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test_setup(flags_keep_arithmetic, setup),  cmocka_unit_test_setup(denormals_survive, setup),
-        cmocka_unit_test_setup(bad_numbers_are_named, setup),  cmocka_unit_test_setup(long_sums_keep_digits, setup),
-        cmocka_unit_test_setup(logits_of_ten_thousand, setup), cmocka_unit_test_setup(masked_rows_are_zero, setup),
-        cmocka_unit_test_setup(equal_keys_fold, setup),        cmocka_unit_test_setup(norms_far_from_zero, setup),
-        cmocka_unit_test_setup(norms_of_nothing, setup),       cmocka_unit_test_setup(positions_stay_exact, setup),
-        cmocka_unit_test_setup(tails_stay_relative, setup),    cmocka_unit_test_setup(adamw_corners, setup),
-        cmocka_unit_test_setup(views_reach_beyond_int, setup), cmocka_unit_test_setup(products_reach_beyond_int, setup),
-        cmocka_unit_test_setup(scans_reach_beyond_int, setup), cmocka_unit_test_setup(plans_count_beyond_int, setup),
+        cmocka_unit_test_setup(flags_keep_arithmetic, setup),
+        cmocka_unit_test_setup(denormals_survive, setup),
+        cmocka_unit_test_setup(bad_numbers_are_named, setup),
+        cmocka_unit_test_setup(long_sums_keep_digits, setup),
+        cmocka_unit_test_setup(logits_of_ten_thousand, setup),
+        cmocka_unit_test_setup(masked_rows_are_zero, setup),
+        cmocka_unit_test_setup(equal_keys_fold, setup),
+        cmocka_unit_test_setup(norms_far_from_zero, setup),
+        cmocka_unit_test_setup(norms_of_nothing, setup),
+        cmocka_unit_test_setup(positions_stay_exact, setup),
+        cmocka_unit_test_setup(softmax_alone, setup),
+        cmocka_unit_test_setup(tails_stay_relative, setup),
+        cmocka_unit_test_setup(adamw_corners, setup),
+        cmocka_unit_test_setup(views_reach_beyond_int, setup),
+        cmocka_unit_test_setup(products_reach_beyond_int, setup),
+        cmocka_unit_test_setup(scans_reach_beyond_int, setup),
+        cmocka_unit_test_setup(plans_count_beyond_int, setup),
         cmocka_unit_test_setup(sizes_do_not_wrap, setup),
     };
     const struct CMUnitTest large[] = {
