@@ -15,6 +15,7 @@ NUM    := -ffp-contract=off -fno-math-errno -fno-trapping-math
 OMP    := -fopenmp
 OPT_release := -O3 -g
 OPT_debug   := -O0 -g3
+OPT_fuzz    := -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 OPT_asan    := -O1 -g -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer
 CFLAGS += $(CSTD) $(WARN) $(NUM) $(OMP) $(OPT_$(MODE))
 
@@ -29,6 +30,9 @@ AVX512 := $(AVX2) -mavx512f -mavx512bw -mavx512vl -mavx512dq -mprefer-vector-wid
 isa     = $(if $(filter %_avx2,$1),$(AVX2)) $(if $(filter %_avx512,$1),$(AVX512)) \
           $(if $(filter %_bf16,$1),$(AVX512) -mavx512bf16) $(if $(filter %_vnni,$1),$(AVX512) -mavx512vnni)
 
+# A fuzz target is called by the fuzzer under this one name; in a test, where all of them are linked, by its file's.
+alias   = $(if $(filter-out fuzz,$(MODE)),$(if $(filter tests/fuzz_%,$1),-DLLVMFuzzerTestOneInput=$(notdir $1)))
+
 ROOMS := lib autograd autograd/ops models data
 SRC   := $(wildcard $(addsuffix /*.c,$(ROOMS)))
 OBJ   := $(SRC:%.c=$B/%.o)
@@ -38,7 +42,7 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
-.PHONY: all everything headers test test-built check lint stress bench-kernels ulp fuzz deps clean help FORCE
+.PHONY: all everything headers test test-built check lint stress bench-kernels ulp fuzz fuzz-run deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
 all: $B/libdar.a ## build the library and the programs
@@ -55,7 +59,7 @@ deps: ## install the Debian packages that are missing
 $B/%.o: %.c $B/flags
 	@mkdir -p $(@D)
 	@echo "CC $<"
-	@$(CC) $(CFLAGS) $(call isa,$*) -MMD -MP -c -o $@ $<
+	@$(CC) $(CFLAGS) $(call isa,$*) $(call alias,$*) -MMD -MP -c -o $@ $<
 
 $B/flags: FORCE
 	@mkdir -p $(@D)
@@ -70,7 +74,9 @@ $B/libdar.a: $(OBJ)
 # ---------------------------------------------------------------- test
 $B/test_%: $B/tests/test_%.o $B/libdar.a
 	@echo "LD $@"
-	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS) -lcmocka
+	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
+
+$B/test_corpus: $(FUZZ:%=$B/tests/%.o)
 
 test: deps ## install what is missing, build, run every test; the last line counts them
 	@$(MAKE) --no-print-directory test-built
@@ -111,6 +117,25 @@ stress: deps ## where numbers break: tests/test_stress.c, with the tests that ta
 ulp: ## exp, tanh, rsqrt, silu at all 2^32 arguments against f64, at every CPU level; a few minutes
 	@$(MAKE) --no-print-directory $B/ulp
 	@$B/ulp
+
+$B/fuzz_%: $B/tests/fuzz_%.o $B/libdar.a
+	@echo "LD $@"
+	@$(CC) -fsanitize=fuzzer -o $@ $^ $(LDFLAGS) $(LIBS)
+
+# What a fuzzer finds stays in build/fuzz; the corpora are made by hand and by scripts/make-fixtures.py.
+SECONDS := 60
+fuzz: ## every parser against damaged input, SECONDS=60 each; needs clang
+	@scripts/install-deps.sh check
+	@$(MAKE) --no-print-directory CC=clang MODE=fuzz fuzz-run
+
+fuzz-run: $(FUZZ:%=$B/%)
+	@for f in $(FUZZ:fuzz_%=%); do \
+		mkdir -p $B/found/$$f; \
+		$B/fuzz_$$f -max_total_time=$(SECONDS) -max_len=4096 -timeout=5 -print_final_stats=1 \
+			-artifact_prefix=$B/$$f- $B/found/$$f tests/corpus/$$f >$B/$$f.log 2>&1 || { \
+			tail -60 $B/$$f.log; exit 1; }; \
+		awk -v f=fuzz_$$f '/^stat::number/ { print f ": " $$2 " inputs, no fault" }' $B/$$f.log; \
+	done
 
 clean: ## remove build/
 	rm -rf build

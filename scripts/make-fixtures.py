@@ -3,6 +3,7 @@
 
     safetensors    reference.safetensors   pip install torch==2.13.0 safetensors numpy
     torch_rng      torch_rng.json          pip install torch==2.13.0 numpy; on a processor with AVX2
+    corpus         ../corpus/              nothing
 
 Run from the root of the tree.  The tests need none of this: the files are committed.
 """
@@ -61,8 +62,64 @@ def torch_rng():
         f.write(json.dumps(out, separators=(",", ":")).replace('{"dtype"', '\n{"dtype"') + "\n")
 
 
+def corpus():
+    """What the fuzzers start from: one small file of every kind, sound and damaged."""
+    import os
+    import struct
+
+    def put(folder, files):
+        os.makedirs(f"tests/corpus/{folder}", exist_ok=True)
+        for name, data in files.items():
+            with open(f"tests/corpus/{folder}/{name}", "wb") as f:
+                f.write(data)
+
+    put("json", {
+        "empty": b"",
+        "object": b'{"a": {"b": [1, -2.5e-3, true, null]}, "c": "d"}',
+        "comments": b'// one\n{/* two */"a": 1} // three',
+        "escapes": rb'["\"\\\/\b\f\n\r\t\u00e9\ud83d\ude00", "\u0000", "\ud800"]',
+        "utf8": '["\u00e9\u20ac\U0001f600"]'.encode(),
+        "not_utf8": b'["\xc0\x80\xff"]',
+        "deep": b"[" * 65 + b"]" * 65,
+        "deepest": b"[" * 64 + b"]" * 64,
+        "twice": rb'{"a": 1, "\u0061": 2}',
+        "numbers": b"[0, -0, 1e308, 1e309, 5e-324, 9007199254740993, 01]",
+        "long_number": b"[" + b"1" * 64 + b"]",
+        "cut": b'{"a": [1, {"b": "c',
+        "set": b'{"a": {"b": 1}, "l": [0]}\0a.b=[1, {"x": null}]\0l.0=text\0n.e.w=1',
+    })
+
+    def file(header, data=0):
+        return struct.pack("<Q", len(header)) + header.encode() + bytes(data)
+
+    def record(dtype, shape, begin, end):
+        return f'{{"dtype":"{dtype}","shape":{shape},"data_offsets":[{begin},{end}]}}'
+
+    f32 = record("F32", [2], 0, 8)
+    put("safetensors", {
+        "empty": file("{}"),
+        "padded": file('{"a":' + f32 + "}   ", 8),
+        "several": file('{"__metadata__":{"k":"v"},"a":' + f32 + ',"b":' + record("BF16", [3, 1], 8, 14)
+                        + ',"c":' + record("I64", [], 14, 22) + "}", 22),
+        "askew": file('{"a":' + record("U8", [1], 0, 1) + ',"b":' + record("F64", [1], 1, 9) + "}", 9),
+        "hole": file('{"a":' + f32 + ',"b":' + record("U8", [1], 9, 10) + "}", 10),
+        "overlap": file('{"a":' + f32 + ',"b":' + f32 + "}", 8),
+        "trailing": file('{"a":' + f32 + "}", 9),
+        "short": file('{"a":' + f32 + "}", 7),
+        "huge_length": b"\xff" * 8 + b"{}",
+        "product": file('{"a":' + record("F32", [2**32, 2**32], 0, 8) + "}", 8),
+        "three_factors": file('{"a":' + record("U8", [2**22, 2**22, 2**21], 0, 8) + "}", 8),
+        "zero": file('{"a":' + record("F32", [0], 0, 0) + "}"),
+        "nine_dims": file('{"a":' + record("F32", [1] * 9, 0, 4) + "}", 4),
+        "sign": file('{"a":' + record("F32", [-2], 0, 8) + "}", 8),
+        "twice": file('{"a":' + f32 + ',"a":' + f32 + "}", 8),
+        "deep": file('{"a":' + "[" * 70 + "}"),
+        "name": file('{"a\\nb":' + f32 + "}", 8),
+    })
+
+
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (safetensors, torch_rng)}
+    known = {f.__name__: f for f in (safetensors, torch_rng, corpus)}
     if not sys.argv[1:] or any(name not in known for name in sys.argv[1:]):
         sys.exit(__doc__)
     for name in sys.argv[1:]:
