@@ -15,6 +15,7 @@
 #define FILL   16   /* rows of col made at a time before they are packed: first-level cache */
 #define BESIDE 16   /* elements between rows of col, so that they do not share their place in the cache */
 #define GROUP  16   /* output channels of w turned at a time; even: whole units */
+#define LANES  48   /* input channels, likewise; whole stripes of every tile */
 #define FLUSH  8192 /* pixels summed in one accumulator before it goes to gw: bounds the error of long sums */
 #define LINE   16   /* columns of gw^T turned at a time: a cache line of f32 */
 
@@ -116,7 +117,7 @@ static void cut_pixels(struct job *j, dar_dtype w)
     j->packs_a = j->mirrored || w != j->operand || j->K % t->unit; /* else w is read where it lies */
     if (j->packs_a) j->shared = aligned(blocks_of(Cout, t->mr) * dar_tile_bytes_a(t, j->K));
     j->col_bytes =
-        aligned(most(FILL * (j->n + BESIDE) * dar_dtype_size(j->col), t->mr * GROUP * j->taps * dar_dtype_size(w)));
+        aligned(most(FILL * (j->n + BESIDE) * dar_dtype_size(j->col), LANES * GROUP * j->taps * dar_dtype_size(w)));
 }
 
 /* gcol, by channels of x: a task adds to its channels alone. */
@@ -466,41 +467,46 @@ static void correlate_task(void *ctx, size_t i, int thread)
     store(f, o0, m, q0, n, r.c);
 }
 
-/* A stripe of w for gx: row i is input channel c0 + i, column o taps + tap is w[o, c0 + i, tap]. */
-static void turn_weights(const struct correlate *f, size_t c0, char *dst, char *buf)
+/* Stripes of w for gx from c0: row i is input channel c0 + i, column o taps + tap is w[o, c0 + i, tap]. */
+static void turn_weights(const struct correlate *f, size_t c0, size_t lanes, char *dst, char *buf)
 {
     const struct job *j = &f->j;
     const dar_tile *t = j->tile;
-    size_t lanes = least(t->mr, j->c.Cout - c0), size = dar_dtype_size(f->w->dtype), run = j->taps * size;
+    size_t size = dar_dtype_size(f->w->dtype), run = j->taps * size, row = GROUP * run;
 
     for (size_t o = 0; o < j->c.Cin; o += GROUP) {
         size_t n = least(GROUP, j->c.Cin - o);
         for (size_t u = 0; u < n; u++) {
             const char *src = (char *)f->w->data + ((o + u) * j->c.Cout + c0) * run;
-            for (size_t i = 0; i < lanes; i++) memcpy(buf + (i * GROUP + u) * run, src + i * run, run);
+            for (size_t i = 0; i < lanes; i++) memcpy(buf + i * row + u * run, src + i * run, run);
         }
-        dar_tile_pack_a_mk(t, f->w->dtype, buf, GROUP * j->taps, lanes, n * j->taps,
-                           dst + o * j->taps / t->unit * t->mr * t->unit_bytes);
+        for (size_t i = 0; i < lanes; i += t->mr)
+            dar_tile_pack_a_mk(t, f->w->dtype, buf + i * row, GROUP * j->taps, least(t->mr, lanes - i), n * j->taps,
+                               dst + i / t->mr * dar_tile_bytes_a(t, j->K) +
+                                   o * j->taps / t->unit * t->mr * t->unit_bytes);
     }
 }
 
-static void pack_weights(void *ctx, size_t i, int thread)
+static void pack_weights(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct correlate *f = ctx;
     const struct job *j = &f->j;
     const dar_tile *t = j->tile;
-    size_t o = i * t->mr, row = j->K * dar_dtype_size(f->w->dtype);
-    char *dst = f->scratch + i * dar_tile_bytes_a(t, j->K);
+    size_t row = j->K * dar_dtype_size(f->w->dtype), stripe = dar_tile_bytes_a(t, j->K);
 
-    if (j->mirrored) turn_weights(f, o, dst, room_of(j, f->scratch, thread).col);
-    else dar_tile_pack_a_mk(t, f->w->dtype, (char *)f->w->data + o * row, j->K, least(t->mr, j->c.Cout - o), j->K, dst);
+    if (j->mirrored)
+        turn_weights(f, begin, end - begin, f->scratch + begin / t->mr * stripe, room_of(j, f->scratch, thread).col);
+    else
+        for (size_t o = begin; o < end; o += t->mr)
+            dar_tile_pack_a_mk(t, f->w->dtype, (char *)f->w->data + o * row, j->K, least(t->mr, end - o), j->K,
+                               f->scratch + o / t->mr * stripe);
 }
 
 static void correlate(struct correlate *f)
 {
     const struct job *j = &f->j;
     size_t N = j->c.B * j->P;
-    if (j->packs_a && N) dar_parallel(blocks_of(j->c.Cout, j->tile->mr), pack_weights, f);
+    if (j->packs_a && N) dar_parallel_range(j->c.Cout, LANES, pack_weights, f);
     dar_parallel(blocks_of(j->c.Cout, j->m) * blocks_of(N, j->n), correlate_task, f);
 }
 

@@ -24,51 +24,101 @@ struct attr {
 
 /* ---------------------------------------------------------------- rows */
 
-/* take: acc[i] (+)= src[i step].  spread: dst[i step] (+)= scale v[i].  The usual steps are constants, so that they
- * vectorise. */
-#define DEF_ROW(NAME, TYPE)                                                                                            \
-    static inline __attribute__((always_inline)) void take_step_##NAME(size_t n, const TYPE *src, size_t step,         \
-                                                                       TYPE *acc, bool add)                            \
+/* Every step-th element of a row, and back.  Steps of 1 and 2 are constants, so that they vectorise.
+ *   take     acc[i] (+)= src[i step]
+ *   take2    acc[i] (+)= src[2i] + src[2i + 1]
+ *   spread   dst[i step] (+)= scale v[i]
+ *   spread2  dst[2i] (+)= scale v[i], dst[2i + 1] (+)= scale u[i] */
+#define STEPS(CALL)                                                                                                    \
+    do {                                                                                                               \
+        if (step == 1) CALL(1);                                                                                        \
+        else if (step == 2) CALL(2);                                                                                   \
+        else CALL(step);                                                                                               \
+    } while (0)
+#define ADD_ALL(s)                                                                                                     \
+    for (size_t i = 0; i < n; i++) acc[i] += src[i * (s)]
+#define GET_ALL(s)                                                                                                     \
+    for (size_t i = 0; i < n; i++) acc[i] = src[i * (s)]
+#define ADD_EACH(s)                                                                                                    \
+    for (size_t i = 0; i < n; i++) dst[i * (s)] += scale * v[i]
+#define SCALE_EACH(s)                                                                                                  \
+    for (size_t i = 0; i < n; i++) dst[i * (s)] = scale * v[i]
+#define PUT_EACH(s)                                                                                                    \
+    for (size_t i = 0; i < n; i++) dst[i * (s)] = v[i]
+
+#define DEF_SUMS(NAME, TYPE)                                                                                           \
+    static void take_##NAME(size_t n, const void *src_, size_t step, void *acc_, bool add)                             \
     {                                                                                                                  \
+        const TYPE *src = src_;                                                                                        \
+        TYPE *acc = acc_;                                                                                              \
+        if (add) STEPS(ADD_ALL);                                                                                       \
+        else STEPS(GET_ALL);                                                                                           \
+    }                                                                                                                  \
+    static void take2_##NAME(size_t n, const void *src_, void *acc_, bool add)                                         \
+    {                                                                                                                  \
+        const TYPE *src = src_;                                                                                        \
+        TYPE *acc = acc_;                                                                                              \
         if (add)                                                                                                       \
-            for (size_t i = 0; i < n; i++) acc[i] = (TYPE)(acc[i] + src[i * step]);                                    \
+            for (size_t i = 0; i < n; i++) acc[i] += src[2 * i] + src[2 * i + 1];                                      \
         else                                                                                                           \
-            for (size_t i = 0; i < n; i++) acc[i] = src[i * step];                                                     \
+            for (size_t i = 0; i < n; i++) acc[i] = src[2 * i] + src[2 * i + 1];                                       \
     }                                                                                                                  \
-    static void take_##NAME(size_t n, const void *src, size_t step, void *acc, bool add)                               \
+    static void spread_##NAME(size_t n, const void *v_, double by, void *dst_, size_t step, bool add)                  \
     {                                                                                                                  \
-        if (step == 1) take_step_##NAME(n, src, 1, acc, add);                                                          \
-        else if (step == 2) take_step_##NAME(n, src, 2, acc, add);                                                     \
-        else take_step_##NAME(n, src, step, acc, add);                                                                 \
+        const TYPE *v = v_, scale = (TYPE)by;                                                                          \
+        TYPE *dst = dst_;                                                                                              \
+        if (add) STEPS(ADD_EACH);                                                                                      \
+        else STEPS(SCALE_EACH);                                                                                        \
     }                                                                                                                  \
-    static inline __attribute__((always_inline)) void spread_step_##NAME(size_t n, const TYPE *v, TYPE scale,          \
-                                                                         TYPE *dst, size_t step, bool add)             \
+    static void spread2_##NAME(size_t n, const void *v_, const void *u_, double by, void *dst_, bool add)              \
     {                                                                                                                  \
+        const TYPE *v = v_, *u = u_, scale = (TYPE)by;                                                                 \
+        TYPE *dst = dst_;                                                                                              \
         if (add)                                                                                                       \
-            for (size_t i = 0; i < n; i++) dst[i * step] = (TYPE)(dst[i * step] + scale * v[i]);                       \
+            for (size_t i = 0; i < n; i++) dst[2 * i] += scale * v[i], dst[2 * i + 1] += scale * u[i];                 \
         else                                                                                                           \
-            for (size_t i = 0; i < n; i++) dst[i * step] = (TYPE)(scale * v[i]);                                       \
-    }                                                                                                                  \
-    static void spread_##NAME(size_t n, const void *v, double scale, void *dst, size_t step, bool add)                 \
-    {                                                                                                                  \
-        if (step == 1) spread_step_##NAME(n, v, (TYPE)scale, dst, 1, add);                                             \
-        else if (step == 2) spread_step_##NAME(n, v, (TYPE)scale, dst, 2, add);                                        \
-        else spread_step_##NAME(n, v, (TYPE)scale, dst, step, add);                                                    \
+            for (size_t i = 0; i < n; i++) dst[2 * i] = scale * v[i], dst[2 * i + 1] = scale * u[i];                   \
     }
 
-DEF_ROW(f64, double)
-DEF_ROW(f32, float)
-DEF_ROW(bits, uint16_t) /* bf16 and f16 are only moved: scale 1, no add */
+DEF_SUMS(f64, double)
+DEF_SUMS(f32, float)
+
+/* 16-bit elements are only moved: scale is 1 and add false. */
+static void take_bits(size_t n, const void *src_, size_t step, void *acc_, bool add)
+{
+    const uint16_t *src = src_;
+    uint16_t *acc = acc_;
+    (void)add;
+    STEPS(GET_ALL);
+}
+
+static void spread_bits(size_t n, const void *v_, double by, void *dst_, size_t step, bool add)
+{
+    const uint16_t *v = v_;
+    uint16_t *dst = dst_;
+    (void)by, (void)add;
+    STEPS(PUT_EACH);
+}
+
+static void spread2_bits(size_t n, const void *v_, const void *u_, double by, void *dst_, bool add)
+{
+    const uint16_t *v = v_, *u = u_;
+    uint16_t *dst = dst_;
+    (void)by, (void)add;
+    for (size_t i = 0; i < n; i++) dst[2 * i] = v[i], dst[2 * i + 1] = u[i];
+}
 
 typedef struct row_fns {
     void (*take)(size_t n, const void *src, size_t step, void *acc, bool add);
+    void (*take2)(size_t n, const void *src, void *acc, bool add);
     void (*spread)(size_t n, const void *v, double scale, void *dst, size_t step, bool add);
+    void (*spread2)(size_t n, const void *v, const void *u, double scale, void *dst, bool add);
 } row_fns;
 
-static const row_fns rows[] = { [DAR_F64] = { take_f64, spread_f64 },
-                                [DAR_F32] = { take_f32, spread_f32 },
-                                [DAR_BF16] = { take_bits, spread_bits },
-                                [DAR_F16] = { take_bits, spread_bits } };
+static const row_fns rows[] = { [DAR_F64] = { take_f64, take2_f64, spread_f64, spread2_f64 },
+                                [DAR_F32] = { take_f32, take2_f32, spread_f32, spread2_f32 },
+                                [DAR_BF16] = { take_bits, NULL, spread_bits, spread2_bits },
+                                [DAR_F16] = { take_bits, NULL, spread_bits, spread2_bits } };
 
 /* ---------------------------------------------------------------- the relation */
 
@@ -76,6 +126,7 @@ struct grid {
     const dar_tensor *fine, *coarse;
     size_t Cf, Tf, Hf, Wf, Cc, Tc, Hc, Wc;
     size_t ft, fs, front, G;
+    size_t beside; /* coarse channels made of the same fine ones: walked together, while those are near */
     size_t step_c, step_a, step_b, step_d;
     double scale;
     bool add;
@@ -106,10 +157,12 @@ static struct grid grid_of(const struct attr *a, const dar_tensor *fine, const d
     struct grid g = { .fine = fine, .coarse = coarse, .ft = (size_t)a->ft, .fs = (size_t)a->fs, .add = add };
     dims(&fine->shape, &g.Cf, &g.Tf, &g.Hf, &g.Wf);
     dims(&coarse->shape, &g.Cc, &g.Tc, &g.Hc, &g.Wc);
-    g.G = g.Cc ? g.Cf * g.ft * g.fs * g.fs / g.Cc : 1;
+    g.G = g.Cf * g.ft * g.fs * g.fs / g.Cc;
     g.front = g.Tc * g.ft - g.Tf;
     g.scale = mean ? 1.0 / (double)g.G : 1;
     g.work = fine->dtype;
+    size_t under = g.ft * g.fs * g.fs / g.G;
+    g.beside = a->order != DAR_FRAMES_FIRST && under && g.Cc % under == 0 ? under : 1;
     if (a->order == DAR_PIXELS_ROWS) {
         g.step_d = 1, g.step_b = g.fs, g.step_a = g.fs * g.fs, g.step_c = g.fs * g.fs * g.ft;
     } else if (a->order == DAR_PIXELS_COLUMNS) {
@@ -125,22 +178,35 @@ static char *element(const dar_tensor *x, size_t i)
     return (char *)x->data + i * dar_dtype_size(x->dtype);
 }
 
-/* n coarse elements of row i from column w: the sum of each one's group. */
-static void sum_group(const struct grid *g, size_t i, size_t w, size_t n, void *acc)
-{
-    size_t h = i % g->Hc, t = i / g->Hc % g->Tc, o = i / g->Hc / g->Tc % g->Cc, batch = i / g->Hc / g->Tc / g->Cc;
-    double buf[DAR_PIECE];
-    bool any = false;
+/* A row of the coarse tensor. */
+struct row {
+    size_t batch, o, t, h;
+};
 
-    for (size_t k = o * g->G; k < (o + 1) * g->G; k++) {
+static struct row row_of(const struct grid *g, size_t i)
+{
+    size_t near = i % g->beside, h = i / g->beside % g->Hc, t = i / g->beside / g->Hc % g->Tc;
+    size_t far = i / g->beside / g->Hc / g->Tc, groups = g->Cc / g->beside;
+    return (struct row){ far / groups, far % groups * g->beside + near, t, h };
+}
+
+/* n coarse elements from column w: the sum of each one's group. */
+static void sum_group(const struct grid *g, const struct row *r, size_t w, size_t n, void *acc)
+{
+    const row_fns *fn = &rows[g->work];
+    bool pairs = g->fs == 2 && g->step_d == 1 && g->G % 2 == 0, any = false;
+    double buf[DAR_PIECE];
+
+    for (size_t k = r->o * g->G; k < (r->o + 1) * g->G; k += pairs ? 2 : 1) {
         struct digits e = digits_of(g, k);
-        if (t * g->ft + e.a < g->front) continue;
-        size_t frame = t * g->ft + e.a - g->front;
-        size_t row = ((batch * g->Cf + e.c) * g->Tf + frame) * g->Hf + h * g->fs + e.b;
-        size_t length = (n - 1) * g->fs + 1;
+        if (r->t * g->ft + e.a < g->front) continue;
+        size_t frame = r->t * g->ft + e.a - g->front;
+        size_t row = ((r->batch * g->Cf + e.c) * g->Tf + frame) * g->Hf + r->h * g->fs + e.b;
+        size_t length = pairs ? 2 * n : (n - 1) * g->fs + 1;
         const void *src = element(g->fine, row * g->Wf + w * g->fs + e.d);
         if (g->work != g->fine->dtype) src = dar_row_get(g->work, g->fine->dtype, src, length, buf);
-        rows[g->work].take(n, src, g->fs, acc, any);
+        if (pairs) fn->take2(n, src, acc, any);
+        else fn->take(n, src, g->fs, acc, any);
         any = true;
     }
     if (!any) memset(acc, 0, n * dar_dtype_size(g->work));
@@ -156,34 +222,42 @@ static void gather_rows(void *ctx, size_t begin, size_t end, int thread)
 
     for (size_t i = begin; i < end; i++)
         for (size_t w = 0; w < g->Wc; w += piece) {
+            struct row r = row_of(g, i);
             size_t n = g->Wc - w < piece ? g->Wc - w : piece;
-            char *to = element(g->coarse, i * g->Wc + w);
-            sum_group(g, i, w, n, direct ? (void *)to : acc);
+            char *to = element(g->coarse, (((r.batch * g->Cc + r.o) * g->Tc + r.t) * g->Hc + r.h) * g->Wc + w);
+            sum_group(g, &r, w, n, direct ? (void *)to : acc);
             if (direct) continue;
             if (g->work == g->coarse->dtype) {
                 rows[g->work].spread(n, acc, g->scale, to, 1, g->add);
             } else {
                 rows[g->work].spread(n, acc, g->scale, acc, 1, false);
-                dar_row_put(g->work, acc, g->coarse->dtype, to, n, g->add);
+                dar_row_put(g->work, acc, g->coarse->dtype, to, n, g->add ? DAR_PUT_ADD : DAR_PUT);
             }
         }
+}
+
+/* The coarse row that feeds elements d, d + fs, ... of a fine row whose other digits make k. */
+static const void *source(const struct grid *g, size_t k, size_t d, const struct row *r)
+{
+    size_t o = (k + d * g->step_d) / g->G;
+    return element(g->coarse, (((r->batch * g->Cc + o) * g->Tc + r->t) * g->Hc + r->h) * g->Wc);
 }
 
 static void spread_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct grid *g = ctx;
+    const row_fns *fn = &rows[g->work];
     (void)thread;
 
     for (size_t i = begin; i < end; i++) {
         size_t h = i % g->Hf, f = i / g->Hf % g->Tf + g->front, c = i / g->Hf / g->Tf % g->Cf;
-        size_t batch = i / g->Hf / g->Tf / g->Cf;
         size_t k = c * g->step_c + f % g->ft * g->step_a + h % g->fs * g->step_b;
-        for (size_t d = 0; d < g->fs; d++) {
-            size_t o = (k + d * g->step_d) / g->G;
-            size_t row = ((batch * g->Cc + o) * g->Tc + f / g->ft) * g->Hc + h / g->fs;
-            rows[g->work].spread(g->Wc, element(g->coarse, row * g->Wc), g->scale, element(g->fine, i * g->Wf + d),
-                                 g->fs, g->add);
-        }
+        struct row r = { i / g->Hf / g->Tf / g->Cf, 0, f / g->ft, h / g->fs };
+        if (g->fs == 2)
+            fn->spread2(g->Wc, source(g, k, 0, &r), source(g, k, 1, &r), g->scale, element(g->fine, i * g->Wf), g->add);
+        else
+            for (size_t d = 0; d < g->fs; d++)
+                fn->spread(g->Wc, source(g, k, d, &r), g->scale, element(g->fine, i * g->Wf + d), g->fs, g->add);
     }
 }
 
@@ -191,9 +265,9 @@ static void spread_rows(void *ctx, size_t begin, size_t end, int thread)
 
 static void gather(struct grid *g)
 {
-    size_t n = dar_tensor_rows(g->coarse), chunk = CHUNK / (g->Wc * g->G + 1);
+    size_t n = dar_tensor_rows(g->coarse), chunk = CHUNK / (g->Wc * g->G + 1) / g->beside * g->beside;
     if (g->G > 1) g->work = dar_compute_type(g->fine->dtype);
-    dar_parallel_range(n, chunk ? chunk : 1, gather_rows, g);
+    dar_parallel_range(n, chunk ? chunk : g->beside, gather_rows, g);
 }
 
 static void spread(struct grid *g)
@@ -211,6 +285,7 @@ static void check_common(const char *name, const dar_shape *x, const struct attr
     DAR_ASSERT(x->n == 4 || x->n == 5, "%s: x is %s, expected [B, C, H, W] or [B, C, T, H, W]", name, text);
     DAR_ASSERT(a->ft >= 1 && a->fs >= 1 && a->fs <= DAR_PIECE && a->channels >= 0, "%s: factors %d, %d, %lld channels",
                name, a->ft, a->fs, (long long)a->channels);
+    DAR_ASSERT(x->d[1] > 0, "%s: x is %s, without channels", name, text);
     DAR_ASSERT(x->n == 5 || a->ft == 1, "%s: x is %s and has no frames", name, text);
 }
 
@@ -311,7 +386,7 @@ static dar_shape up_shape(const dar_shape *in, int n_in, const void *attr)
     if (!a->channels)
         DAR_ASSERT(y.d[1] % block == 0, "resample_up: %s: channels do not divide by %lld", text, (long long)block);
     int64_t channels = a->channels ? a->channels : y.d[1] / block;
-    DAR_ASSERT(y.d[1] > 0 && channels * block % y.d[1] == 0, "resample_up: %s to %lld channels by %d x %d x %d", text,
+    DAR_ASSERT(channels * block % y.d[1] == 0, "resample_up: %s to %lld channels by %d x %d x %d", text,
                (long long)channels, a->ft, a->fs, a->fs);
     y.d[1] = channels;
     DAR_ASSERT(a->front >= 0 && a->front < a->ft, "resample_up: drops %d of each %d frames", a->front, a->ft);
