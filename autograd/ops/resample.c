@@ -143,6 +143,17 @@ static struct digits digits_of(const struct grid *g, size_t k)
                             k / g->step_d % g->fs };
 }
 
+/* k + 1 without a division, except over the channels. */
+static void next_digits(const struct grid *g, size_t k, struct digits *e)
+{
+    size_t *fast = g->step_d < g->step_b ? &e->d : &e->b, *slow = g->step_d < g->step_b ? &e->b : &e->d;
+    if (g->step_c == 1 || g->fs == 1) *e = digits_of(g, k + 1);
+    else if (++*fast == g->fs) {
+        *fast = 0;
+        if (++*slow == g->fs) *e = digits_of(g, k + 1);
+    }
+}
+
 /* [B, C, H, W] is [B, C, 1, H, W]. */
 static void dims(const dar_shape *s, size_t *C, size_t *T, size_t *H, size_t *W)
 {
@@ -178,32 +189,30 @@ static char *element(const dar_tensor *x, size_t i)
     return (char *)x->data + i * dar_dtype_size(x->dtype);
 }
 
-/* A row of the coarse tensor. */
+/* A row of the coarse tensor, but for its channel. */
 struct row {
-    size_t batch, o, t, h;
+    size_t batch, t, h;
 };
 
-static struct row row_of(const struct grid *g, size_t i)
+static void *coarse_row(const struct grid *g, const struct row *r, size_t o)
 {
-    size_t near = i % g->beside, h = i / g->beside % g->Hc, t = i / g->beside / g->Hc % g->Tc;
-    size_t far = i / g->beside / g->Hc / g->Tc, groups = g->Cc / g->beside;
-    return (struct row){ far / groups, far % groups * g->beside + near, t, h };
+    return element(g->coarse, (((r->batch * g->Cc + o) * g->Tc + r->t) * g->Hc + r->h) * g->Wc);
 }
 
-/* n coarse elements from column w: the sum of each one's group. */
-static void sum_group(const struct grid *g, const struct row *r, size_t w, size_t n, void *acc)
+/* n coarse elements from column w: the sum of the G numbers from k, whose digits are e; leaves e behind them. */
+static void sum_group(const struct grid *g, const struct row *r, size_t k, struct digits *e, size_t w, size_t n,
+                      void *acc)
 {
     const row_fns *fn = &rows[g->work];
     bool pairs = g->fs == 2 && g->step_d == 1 && g->G % 2 == 0, any = false;
     double buf[DAR_PIECE];
 
-    for (size_t k = r->o * g->G; k < (r->o + 1) * g->G; k += pairs ? 2 : 1) {
-        struct digits e = digits_of(g, k);
-        if (r->t * g->ft + e.a < g->front) continue;
-        size_t frame = r->t * g->ft + e.a - g->front;
-        size_t row = ((r->batch * g->Cf + e.c) * g->Tf + frame) * g->Hf + r->h * g->fs + e.b;
+    for (size_t end = k + g->G; k < end; next_digits(g, k++, e)) {
+        if (r->t * g->ft + e->a < g->front || (pairs && e->d)) continue;
+        size_t frame = r->t * g->ft + e->a - g->front;
+        size_t row = ((r->batch * g->Cf + e->c) * g->Tf + frame) * g->Hf + r->h * g->fs + e->b;
         size_t length = pairs ? 2 * n : (n - 1) * g->fs + 1;
-        const void *src = element(g->fine, row * g->Wf + w * g->fs + e.d);
+        const void *src = element(g->fine, row * g->Wf + w * g->fs + e->d);
         if (g->work != g->fine->dtype) src = dar_row_get(g->work, g->fine->dtype, src, length, buf);
         if (pairs) fn->take2(n, src, acc, any);
         else fn->take(n, src, g->fs, acc, any);
@@ -212,35 +221,38 @@ static void sum_group(const struct grid *g, const struct row *r, size_t w, size_
     if (!any) memset(acc, 0, n * dar_dtype_size(g->work));
 }
 
+static void store_sum(const struct grid *g, size_t n, void *acc, void *to)
+{
+    if (g->work == g->coarse->dtype) {
+        rows[g->work].spread(n, acc, g->scale, to, 1, g->add);
+    } else {
+        rows[g->work].spread(n, acc, g->scale, acc, 1, false);
+        dar_row_put(g->work, acc, g->coarse->dtype, to, n, g->add ? DAR_PUT_ADD : DAR_PUT);
+    }
+}
+
+/* Items are rows of `beside` channels together. */
 static void gather_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct grid *g = ctx;
-    size_t piece = DAR_PIECE / g->fs;
+    size_t piece = DAR_PIECE / g->fs, groups = g->Cc / g->beside;
     bool direct = g->work == g->coarse->dtype && g->scale == 1 && !g->add;
     double acc[DAR_PIECE];
     (void)thread;
 
-    for (size_t i = begin; i < end; i++)
+    for (size_t i = begin; i < end; i++) {
+        size_t far = i / g->Hc / g->Tc, o = far % groups * g->beside;
+        struct row r = { far / groups, i / g->Hc % g->Tc, i % g->Hc };
         for (size_t w = 0; w < g->Wc; w += piece) {
-            struct row r = row_of(g, i);
             size_t n = g->Wc - w < piece ? g->Wc - w : piece;
-            char *to = element(g->coarse, (((r.batch * g->Cc + r.o) * g->Tc + r.t) * g->Hc + r.h) * g->Wc + w);
-            sum_group(g, &r, w, n, direct ? (void *)to : acc);
-            if (direct) continue;
-            if (g->work == g->coarse->dtype) {
-                rows[g->work].spread(n, acc, g->scale, to, 1, g->add);
-            } else {
-                rows[g->work].spread(n, acc, g->scale, acc, 1, false);
-                dar_row_put(g->work, acc, g->coarse->dtype, to, n, g->add ? DAR_PUT_ADD : DAR_PUT);
+            struct digits e = digits_of(g, o * g->G);
+            for (size_t near = o; near < o + g->beside; near++) {
+                char *to = (char *)coarse_row(g, &r, near) + w * dar_dtype_size(g->coarse->dtype);
+                sum_group(g, &r, near * g->G, &e, w, n, direct ? (void *)to : acc);
+                if (!direct) store_sum(g, n, acc, to);
             }
         }
-}
-
-/* The coarse row that feeds elements d, d + fs, ... of a fine row whose other digits make k. */
-static const void *source(const struct grid *g, size_t k, size_t d, const struct row *r)
-{
-    size_t o = (k + d * g->step_d) / g->G;
-    return element(g->coarse, (((r->batch * g->Cc + o) * g->Tc + r->t) * g->Hc + r->h) * g->Wc);
+    }
 }
 
 static void spread_rows(void *ctx, size_t begin, size_t end, int thread)
@@ -252,12 +264,15 @@ static void spread_rows(void *ctx, size_t begin, size_t end, int thread)
     for (size_t i = begin; i < end; i++) {
         size_t h = i % g->Hf, f = i / g->Hf % g->Tf + g->front, c = i / g->Hf / g->Tf % g->Cf;
         size_t k = c * g->step_c + f % g->ft * g->step_a + h % g->fs * g->step_b;
-        struct row r = { i / g->Hf / g->Tf / g->Cf, 0, f / g->ft, h / g->fs };
+        struct row r = { i / g->Hf / g->Tf / g->Cf, f / g->ft, h / g->fs };
+        char *dst = element(g->fine, i * g->Wf);
         if (g->fs == 2)
-            fn->spread2(g->Wc, source(g, k, 0, &r), source(g, k, 1, &r), g->scale, element(g->fine, i * g->Wf), g->add);
+            fn->spread2(g->Wc, coarse_row(g, &r, k / g->G), coarse_row(g, &r, (k + g->step_d) / g->G), g->scale, dst,
+                        g->add);
         else
             for (size_t d = 0; d < g->fs; d++)
-                fn->spread(g->Wc, source(g, k, d, &r), g->scale, element(g->fine, i * g->Wf + d), g->fs, g->add);
+                fn->spread(g->Wc, coarse_row(g, &r, (k + d * g->step_d) / g->G), g->scale,
+                           dst + d * dar_dtype_size(g->fine->dtype), g->fs, g->add);
     }
 }
 
@@ -265,9 +280,9 @@ static void spread_rows(void *ctx, size_t begin, size_t end, int thread)
 
 static void gather(struct grid *g)
 {
-    size_t n = dar_tensor_rows(g->coarse), chunk = CHUNK / (g->Wc * g->G + 1) / g->beside * g->beside;
+    size_t n = dar_tensor_rows(g->coarse) / g->beside, chunk = CHUNK / (g->Wc * g->G * g->beside + 1);
     if (g->G > 1) g->work = dar_compute_type(g->fine->dtype);
-    dar_parallel_range(n, chunk ? chunk : g->beside, gather_rows, g);
+    dar_parallel_range(n, chunk ? chunk : 1, gather_rows, g);
 }
 
 static void spread(struct grid *g)
