@@ -16,7 +16,7 @@
 struct layer {
     dar_gemm gemm;
     void *scratch;
-    float *x, *w, *y; /* for OpenBLAS */
+    float *c; /* for OpenBLAS */
 };
 
 const char *bench_blas_core(void)
@@ -24,28 +24,16 @@ const char *bench_blas_core(void)
     return openblas_get_corename();
 }
 
-static struct layer *setup_layer(bench *b)
-{
-    struct layer *l = dar_arena_push(b->arena, sizeof *l);
-    *l = (struct layer){ 0 };
-    b->state = l;
-    b->flops[0] = 2.0 * (double)b->s[0] * (double)b->s[1] * (double)b->s[2];
-    if (!b->row->against_rival) return l;
-    l->x = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[2])).data;
-    l->w = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[1], b->s[2])).data;
-    l->y = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[1])).data;
-    return l;
-}
-
+/* An operand [rows, columns] as stored; t: used transposed. */
 static dar_matrix matrix(bench *b, dar_dtype type, int64_t rows, int64_t columns, bool t)
 {
     return (dar_matrix){ type, bench_tensor(b, type, DAR_SHAPE(rows, columns)).data, (size_t)columns, t, NULL };
 }
 
-/* C [m, n] = a b over k, stored as type. */
-static void setup_gemm(bench *b, int64_t m, int64_t n, int64_t k, dar_matrix p, dar_matrix q, dar_dtype type)
+/* C [m, n] = p q over k, stored as type. */
+static void setup_product(bench *b, int64_t m, int64_t n, int64_t k, dar_matrix p, dar_matrix q, dar_dtype type)
 {
-    struct layer *l = b->state;
+    struct layer *l = dar_arena_push(b->arena, sizeof *l);
     l->gemm = (dar_gemm){ .kind = dar_gemm_kind(b->row->type, b->row->type),
                           .m = (size_t)m,
                           .n = (size_t)n,
@@ -57,71 +45,50 @@ static void setup_gemm(bench *b, int64_t m, int64_t n, int64_t k, dar_matrix p, 
                           .c = bench_tensor(b, type, DAR_SHAPE(m, n)).data,
                           .ldc = (size_t)n };
     l->scratch = dar_arena_push(b->arena, dar_gemm_scratch(&l->gemm));
+    if (b->row->against_rival) l->c = bench_tensor(b, DAR_F32, DAR_SHAPE(m, n)).data;
+    b->state = l;
+    b->flops[0] = 2.0 * (double)m * (double)n * (double)k;
 }
-
-static void run_gemm(bench *b)
-{
-    const struct layer *l = b->state;
-    dar_gemm_run(&l->gemm, l->scratch);
-}
-
-/* ---------------------------------------------------------------- y = x w^T */
 
 static void setup_nt(bench *b)
 {
     int64_t M = b->s[0], N = b->s[1], K = b->s[2];
     dar_dtype t = b->row->type;
-    setup_layer(b);
-    setup_gemm(b, M, N, K, matrix(b, t, M, K, false), matrix(b, t, N, K, true), t);
+    setup_product(b, M, N, K, matrix(b, t, M, K, false), matrix(b, t, N, K, true), t);
 }
-
-static void blas_nt(bench *b)
-{
-    const struct layer *l = b->state;
-    int M = (int)b->s[0], N = (int)b->s[1], K = (int)b->s[2];
-    openblas_set_num_threads(dar_threads());
-    cblas_sgemm(CblasRowMajor, CblasNoTrans, CblasTrans, M, N, K, 1, l->x, K, l->w, K, 0, l->y, N);
-}
-
-/* ---------------------------------------------------------------- gx = gy w */
 
 static void setup_nn(bench *b)
 {
     int64_t M = b->s[0], N = b->s[1], K = b->s[2];
-    setup_layer(b);
-    setup_gemm(b, M, K, N, matrix(b, DAR_F32, M, N, false), matrix(b, b->row->type, N, K, false), DAR_F32);
+    setup_product(b, M, K, N, matrix(b, DAR_F32, M, N, false), matrix(b, b->row->type, N, K, false), DAR_F32);
 }
-
-static void blas_nn(bench *b)
-{
-    const struct layer *l = b->state;
-    int M = (int)b->s[0], N = (int)b->s[1], K = (int)b->s[2];
-    openblas_set_num_threads(dar_threads());
-    cblas_sgemm(CblasRowMajor, CblasNoTrans, CblasNoTrans, M, K, N, 1, l->y, N, l->w, K, 0, l->x, K);
-}
-
-/* ---------------------------------------------------------------- gw = gy^T x */
 
 static void setup_tn(bench *b)
 {
     int64_t M = b->s[0], N = b->s[1], K = b->s[2];
-    setup_layer(b);
-    setup_gemm(b, N, K, M, matrix(b, DAR_F32, M, N, true), matrix(b, b->row->type, M, K, false), DAR_F32);
+    setup_product(b, N, K, M, matrix(b, DAR_F32, M, N, true), matrix(b, b->row->type, M, K, false), DAR_F32);
 }
 
-static void blas_tn(bench *b)
+static void run_product(bench *b)
 {
     const struct layer *l = b->state;
-    int M = (int)b->s[0], N = (int)b->s[1], K = (int)b->s[2];
+    dar_gemm_run(&l->gemm, l->scratch);
+}
+
+static void run_blas(bench *b)
+{
+    const struct layer *l = b->state;
+    const dar_gemm *g = &l->gemm;
     openblas_set_num_threads(dar_threads());
-    cblas_sgemm(CblasRowMajor, CblasTrans, CblasNoTrans, N, K, M, 1, l->y, N, l->x, K, 0, l->w, K);
+    cblas_sgemm(CblasRowMajor, g->a.t ? CblasTrans : CblasNoTrans, g->b.t ? CblasTrans : CblasNoTrans, (int)g->m,
+                (int)g->n, (int)g->k, 1, g->a.data, (int)g->a.ld, g->b.data, (int)g->b.ld, 0, l->c, (int)g->n);
 }
 
 /* ---------------------------------------------------------------- rows */
 
-static const bench_kind nt = { .part = { "gemm_nt" }, .setup = setup_nt, .run = { run_gemm }, .rival = blas_nt };
-static const bench_kind nn = { .part = { "gemm_nn" }, .setup = setup_nn, .run = { run_gemm }, .rival = blas_nn };
-static const bench_kind tn = { .part = { "gemm_tn" }, .setup = setup_tn, .run = { run_gemm }, .rival = blas_tn };
+static const bench_kind nt = { .part = { "gemm_nt" }, .setup = setup_nt, .run = { run_product }, .rival = run_blas };
+static const bench_kind nn = { .part = { "gemm_nn" }, .setup = setup_nn, .run = { run_product }, .rival = run_blas };
+static const bench_kind tn = { .part = { "gemm_tn" }, .setup = setup_tn, .run = { run_product }, .rival = run_blas };
 
 #define LAYER(kind, type, peak, bar, M, N, K)                                                                          \
     {                                                                                                                  \

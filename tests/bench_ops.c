@@ -265,25 +265,16 @@ static const bench_kind conv3d = { BENCH_OP(conv3d), .inputs = clip, .call = cal
 
 /* ---------------------------------------------------------------- rows */
 
-#define ATTN(...)                                                                                                      \
-    { &attention, DAR_F32, { __VA_ARGS__ }, BENCH_F32, { 0.80, 0.68 }, false },                                        \
+/* In the two types that networks use.  Memory-bound rows are larger than the caches; PLAIN: without a bar. */
+#define BOTH(kind, peak_f32, peak_bf16, bar, bar_back, ...)                                                            \
+    { &kind, DAR_F32, { __VA_ARGS__ }, peak_f32, { bar, bar_back }, false },                                           \
     {                                                                                                                  \
-        &attention, DAR_BF16, { __VA_ARGS__ }, BENCH_BF16, { 0.80, 0.68 }, false                                       \
+        &kind, DAR_BF16, { __VA_ARGS__ }, peak_bf16, { bar, bar_back }, false                                          \
     }
-#define CONV(kind, ...)                                                                                                \
-    { &kind, DAR_F32, { __VA_ARGS__ }, BENCH_F32, { 0.70, 0.70 }, false },                                             \
-    {                                                                                                                  \
-        &kind, DAR_BF16, { __VA_ARGS__ }, BENCH_BF16, { 0.70, 0.70 }, false                                            \
-    }
-
-/* Larger than the caches, in the two types that networks use; PLAIN: without a bar. */
-#define BOTH(kind, bar, ...)                                                                                           \
-    { &kind, DAR_F32, { __VA_ARGS__ }, BENCH_COPY, { bar, bar }, false },                                              \
-    {                                                                                                                  \
-        &kind, DAR_BF16, { __VA_ARGS__ }, BENCH_COPY, { bar, bar }, false                                              \
-    }
-#define STREAM(kind, ...) BOTH(kind, 0.8, __VA_ARGS__)
-#define PLAIN(kind, ...)  BOTH(kind, 0, __VA_ARGS__)
+#define ATTN(...)         BOTH(attention, BENCH_F32, BENCH_BF16, 0.80, 0.68, __VA_ARGS__)
+#define CONV(kind, ...)   BOTH(kind, BENCH_F32, BENCH_BF16, 0.70, 0.70, __VA_ARGS__)
+#define STREAM(kind, ...) BOTH(kind, BENCH_COPY, BENCH_COPY, 0.80, 0.80, __VA_ARGS__)
+#define PLAIN(kind, ...)  BOTH(kind, BENCH_COPY, BENCH_COPY, 0, 0, __VA_ARGS__)
 
 const bench_row bench_op_rows[] = {
     ATTN(1536, 6, 64),
