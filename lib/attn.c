@@ -23,7 +23,7 @@
 #include "lib/tile.h"
 
 #define LOG2_E 1.4426950408889634
-#define TASKS  32  /* wanted of few heads, so that many processors have work */
+#define TASKS  16  /* wanted of few heads, so that many processors have work */
 #define DEPTH  256 /* units of k that a product takes at a time: a stripe stays in the first-level cache */
 #define EDGE   16  /* columns beside a block, so that its rows lie in different sets of the caches */
 
@@ -122,6 +122,14 @@ static char *row_at(const dar_tensor *x, size_t row, size_t col)
     return (char *)x->data + (row * (size_t)x->shape.d[2] + col) * dar_dtype_size(x->dtype);
 }
 
+/* Ask for n rows of one head from row `first` on, of those before `end`. */
+static void ahead(const struct job *j, const dar_tensor *x, size_t first, size_t n, size_t end, size_t col)
+{
+    size_t size = dar_dtype_size(x->dtype);
+    if (first + n > end) n = first < end ? end - first : 0;
+    for (const char *p = row_at(x, first, col); n; n--, p += j->D * size) dar_row_ahead(p, j->E * size);
+}
+
 /* ---------------------------------------------------------------- packing and products */
 
 /* Rows of src along stripes, its columns along k: the left operand of src x, or the right one of x src^T. */
@@ -191,7 +199,7 @@ static const void *log_weights(const struct job *j, size_t b, size_t k0, size_t 
 
 /* ---------------------------------------------------------------- forward */
 
-#define ROWS 96  /* queries of a block */
+#define ROWS 24  /* queries of a block: its products stay in the first-level cache */
 #define KEYS 256 /* keys of a block */
 
 struct forward_scratch {
@@ -227,7 +235,7 @@ static struct job forward_job(const dar_attn *a)
     struct carve c = { 0 };
     size_t heads = j.B * j.A;
 
-    j.range = range_of(j.Nq, ceil_div(TASKS, heads ? heads : 1), ROWS, 2 * ROWS, 8 * ROWS);
+    j.range = range_of(j.Nq, ceil_div(TASKS, heads ? heads : 1), ROWS, 8 * ROWS, 32 * ROWS);
     j.ranges = ceil_div(j.Nq, j.range);
     forward_carve(&j, &c);
     j.per_thread = c.used;
@@ -236,7 +244,7 @@ static struct job forward_job(const dar_attn *a)
 
 /* A block of queries against the packed block of keys. */
 static void forward_block(const struct job *j, const struct forward_scratch *f, size_t i0, size_t m, size_t n,
-                          const void *lw)
+                          const void *lw, bool first)
 {
     size_t unit = j->outer->unit;
     char *o = f->o + i0 * j->E * j->real_size;
@@ -250,6 +258,7 @@ static void forward_block(const struct job *j, const struct forward_scratch *f, 
         .ld = f->ld,
         .c = j->c,
         .lw = lw,
+        .first = first,
         .p = f->p,
         .ldp = f->ld,
         .max = f->max + i0 * j->real_size,
@@ -259,15 +268,7 @@ static void forward_block(const struct job *j, const struct forward_scratch *f, 
         .E = j->E,
     });
     struct left p = { f->p, f->ld / unit, 1, j->outer->mr * f->ld * j->operand_size };
-    product(j->outer, m, j->E, n, p, f->v, o, j->E, true);
-}
-
-static double lanes_sum(dar_dtype real, const void *sum)
-{
-    double s = 0;
-    for (size_t i = 0; i < DAR_ATTN_LANES; i++)
-        s += real == DAR_F64 ? ((const double *)sum)[i] : (double)((const float *)sum)[i];
-    return s;
+    product(j->outer, m, j->E, n, p, f->v, o, j->E, !first);
 }
 
 /* Divide by the sums, store y and the statistics. */
@@ -277,7 +278,7 @@ static void forward_finish(const struct job *j, const struct forward_scratch *f,
     size_t b = head / j->A, h = head % j->A;
 
     for (size_t i = 0; i < rows; i++) {
-        double sum = lanes_sum(j->real, f->sum + i * DAR_ATTN_LANES * j->real_size);
+        double sum = j->rows->sum(DAR_ATTN_LANES, f->sum + i * DAR_ATTN_LANES * j->real_size);
         char *y = row_at(&a->y, b * j->Nq + q0 + i, h * j->E);
         void *to = dar_row_out(j->real, a->y.dtype, y, DAR_PUT, f->row);
         j->rows->scale(j->E, sum == 0 ? 0 : 1 / sum, f->o + i * j->E * j->real_size, to);
@@ -297,20 +298,25 @@ static void forward_task(void *ctx, size_t task, int thread)
     struct forward_scratch f = forward_carve(j, &c);
     size_t head = task / j->ranges, b = head / j->A, col = head % j->A * j->E;
     size_t q0 = task % j->ranges * j->range, rows = min_size(j->range, j->Nq - q0);
-
-    for (size_t i = 0; i < rows; i += ROWS)
-        pack_rows(j->inner, true, a->q.dtype, row_at(&a->q, b * j->Nq + q0 + i, col), j->D, min_size(ROWS, rows - i),
-                  j->E, f.q + i / ROWS * bytes_a(j->inner, ROWS, j->E));
-    for (size_t i = 0; i < rows; i++) dar_dtype_set(j->real, f.max, i, -INFINITY);
-    memset(f.sum, 0, rows * DAR_ATTN_LANES * j->real_size);
-    memset(f.o, 0, rows * j->E * j->real_size);
+    size_t q_row = b * j->Nq + q0, k_row = b * j->Nk;
 
     for (size_t k0 = 0; k0 < j->Nk; k0 += KEYS) {
         size_t n = min_size(KEYS, j->Nk - k0);
-        pack_rows(j->inner, false, a->k.dtype, row_at(&a->k, b * j->Nk + k0, col), j->D, n, j->E, f.k);
-        pack_cols(j->outer, a->v.dtype, row_at(&a->v, b * j->Nk + k0, col), j->D, n, j->E, f.v);
+        pack_rows(j->inner, false, a->k.dtype, row_at(&a->k, k_row + k0, col), j->D, n, j->E, f.k);
+        pack_cols(j->outer, a->v.dtype, row_at(&a->v, k_row + k0, col), j->D, n, j->E, f.v);
         const void *lw = log_weights(j, b, k0, n, f.lw);
-        for (size_t i = 0; i < rows; i += ROWS) forward_block(j, &f, i, min_size(ROWS, rows - i), n, lw);
+        for (size_t i = 0; i < rows; i += ROWS) {
+            size_t m = min_size(ROWS, rows - i);
+            if (!k0) {
+                pack_rows(j->inner, true, a->q.dtype, row_at(&a->q, q_row + i, col), j->D, m, j->E,
+                          f.q + i / ROWS * bytes_a(j->inner, ROWS, j->E));
+                ahead(j, &a->q, q_row + i + m, ROWS, q_row + rows, col);
+            }
+            size_t part = k_row + k0 + n + i * KEYS / rows;
+            ahead(j, &a->k, part, KEYS * ROWS / rows + 1, k_row + j->Nk, col);
+            ahead(j, &a->v, part, KEYS * ROWS / rows + 1, k_row + j->Nk, col);
+            forward_block(j, &f, i, m, n, lw, !k0);
+        }
     }
     forward_finish(j, &f, head, q0, rows);
 }
@@ -318,6 +324,11 @@ static void forward_task(void *ctx, size_t task, int thread)
 void dar_attn_forward(const dar_attn *a)
 {
     struct job j = forward_job(a);
+    if (!j.Nk) {
+        dar_tensor_fill(&a->y, 0);
+        if (a->stats.data) dar_tensor_fill(&a->stats, 0);
+        return;
+    }
     dar_parallel(j.B * j.A * j.ranges, forward_task, &j);
 }
 

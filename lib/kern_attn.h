@@ -24,10 +24,11 @@ typedef struct dar_attn_soft {
     size_t ld;
     double c;
     const void *lw; /* [n] or NULL: all 0 */
+    bool first;     /* of its rows: max, sum and o hold nothing yet */
     void *p;        /* weights as operands, row i at p + i ldp; an odd last pair is filled with 0; f32, f64: may be s */
     size_t ldp;     /* [elements] */
-    void *max;      /* [m], -inf before the first block; in units of t, or of s if lw is NULL */
-    void *sum;      /* [m, DAR_ATTN_LANES] */
+    void *max;      /* [m] in units of t, or of s if lw is NULL; -inf: no key yet */
+    void *sum;      /* [m, DAR_ATTN_LANES], to be added up */
     void *o;        /* [m, E], row i at o + i ldo: sums weighted so far */
     size_t ldo, E;
 } dar_attn_soft;
