@@ -78,6 +78,8 @@ $B/test_%: $B/tests/test_%.o $B/libdar.a
 
 $B/test_corpus: $(FUZZ:%=$B/tests/%.o)
 
+$B/test_net: $B/tests/net.o
+
 test: deps ## install what is missing, build, run every test; the last line counts them
 	@$(MAKE) --no-print-directory test-built
 

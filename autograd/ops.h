@@ -104,6 +104,32 @@ void dar_rope_table(const dar_tensor *table, int64_t frames, int64_t height, int
 
 /* ---------------------------------------------------------------- products */
 
+typedef enum dar_act { DAR_ACT_NONE, DAR_ACT_GELU_TANH } dar_act;
+
+/* Variations of linear layers. */
+typedef struct dar_linear_opt {
+    dar_act act; /* applied to the sums while they are in the nearest cache */
+    bool cast;   /* y has storage type `out`, not that of x */
+    dar_dtype out;
+} dar_linear_opt;
+
+/* y = act(x W^T + b).
+ *
+ *   x  [.., K]      w  [N, K], i8 too      b  [N] or NULL      y  [.., N]      o  NULL: all zero
+ *
+ * bf16 x and w multiply as bf16 with f32 sums (gradients are rounded to bf16 as operands); any other pair in f32, or
+ * f64 where x is.  i8 weights are scaled back while they are read; they get no gradient.  An activation saves its
+ * argument. */
+dar_val *dar_linear(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, const dar_linear_opt *o);
+
+/* y = act(x W^T + scale (x A^T) U^T + b): a layer with a low-rank addition.
+ *
+ *   a  [r, K]      u  [N, r]      the rest as for linear
+ *
+ * Saves scale x A^T.  Source: Hu et al. 2021, eq. 3. */
+dar_val *dar_lora(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, dar_val *a, dar_val *u, double scale,
+                  const dar_linear_opt *o);
+
 /* ---------------------------------------------------------------- attention */
 
 /* Variations of attention. */
