@@ -72,9 +72,12 @@ $B/libdar.a: $(OBJ)
 -include $(wildcard $B/*/*.d $B/*/*/*.d)
 
 # ---------------------------------------------------------------- test
+comma := ,
+WRAP_test_tape := $(addprefix -Wl$(comma)--wrap=,malloc calloc realloc aligned_alloc posix_memalign mmap)
+
 $B/test_%: $B/tests/test_%.o $B/libdar.a
 	@echo "LD $@"
-	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
+	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(WRAP_$(@F)) $(LIBS) -lcmocka
 
 $B/test_corpus: $(FUZZ:%=$B/tests/%.o)
 

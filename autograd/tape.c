@@ -370,14 +370,12 @@ static void segment_backward(dar_tape *t, const dar_node *node)
     t->last = NULL;
     t->oldest = t->meta.base + t->meta.used;
     t->kept = node->kept;
-    t->kept->at = 0;
     t->replaying = true;
     stand_in(t, node, in);
     dar_val *y = node->fn(t, node->arg, in);
     if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
     y->g = node->y->g;
     y->has_grad = true;
-    y->leaf = true; /* nor is this one */
     sweep(t);
     for (int i = 0; i < node->n; i++)
         if (in[i]) node->in[i]->has_grad = in[i]->has_grad;
