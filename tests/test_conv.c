@@ -136,10 +136,9 @@ static dar_val *leaf(const dar_tensor *x)
 
 static dar_val *run_conv(const struct shape_of_conv *s, dar_val *x, dar_val *w, dar_val *b, dar_val *history)
 {
+    if (s->B == 1) w = dar_contiguous(&tape, w); /* a gradient that is written; else it is added to the leaf's */
     if (s->kt > 1) return dar_conv3d(&tape, x, w, b, history, s->a);
-    w->x.shape = DAR_SHAPE(s->Cout, s->Cin, s->kh, s->kw);
-    w->x = dar_tensor_of(w->x.dtype, w->x.shape, w->x.data);
-    w->g = dar_tensor_of(w->g.dtype, w->x.shape, w->g.data);
+    w = dar_reshape(&tape, w, DAR_SHAPE(s->Cout, s->Cin, s->kh, s->kw));
     return dar_conv2d(&tape, x, w, b, s->a);
 }
 
