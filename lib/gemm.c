@@ -52,30 +52,33 @@ static void pack_lanes(const dar_tile *t, bool a, bool along, dar_dtype type, co
     else (along ? dar_tile_pack_b_nk : dar_tile_pack_b_kn)(t, type, src, ld, k, n, dst);
 }
 
-/* Rows of 8 bits, each with its scale, go through f32. */
+/* Rows of 8 bits, each with its scale, go through f32, a piece of a stripe at a time. */
 static void pack_i8(const dar_matrix *x, const dar_tile *t, bool a, bool along, size_t at, size_t n, size_t k0,
                     size_t k, char *dst)
 {
     float buf[BLAS_COLS * PIECE];
-    size_t wide = a ? t->mr : t->nr;
+    size_t wide = a ? t->mr : t->nr, end = at + n;
     DAR_ASSERT(wide <= BLAS_COLS, "gemm: a stripe of %zu", wide);
-    for (size_t p = 0; p < k; p += PIECE) {
-        size_t kn = k - p < PIECE ? k - p : PIECE, rows = along ? n : kn, cols = along ? kn : n;
-        size_t row0 = along ? at : k0 + p, col0 = along ? k0 + p : at;
-        for (size_t i = 0; i < rows; i++) {
-            const int8_t *q = (const int8_t *)x->data + (row0 + i) * x->ld + col0;
-            float s = x->scale[row0 + i];
-            for (size_t j = 0; j < cols; j++) buf[i * cols + j] = s * q[j];
+    for (; at < end; at += wide)
+        for (size_t p = 0; p < k; p += PIECE) {
+            size_t lanes = end - at < wide ? end - at : wide, kn = k - p < PIECE ? k - p : PIECE;
+            size_t rows = along ? lanes : kn, cols = along ? kn : lanes;
+            size_t row0 = along ? at : k0 + p, col0 = along ? k0 + p : at;
+            for (size_t i = 0; i < rows; i++) {
+                const int8_t *q = (const int8_t *)x->data + (row0 + i) * x->ld + col0;
+                float s = x->scale[row0 + i];
+                for (size_t j = 0; j < cols; j++) buf[i * cols + j] = s * q[j];
+            }
+            pack_lanes(t, a, along, DAR_F32, buf, cols, lanes, kn, dst);
+            dst += dar_tile_units(t, kn) * wide * t->unit_bytes;
         }
-        pack_lanes(t, a, along, DAR_F32, buf, cols, n, kn, dst + p / t->unit * wide * t->unit_bytes);
-    }
 }
 
 static void pack(const dar_matrix *x, const dar_tile *t, bool a, bool along, size_t at, size_t n, size_t k0, size_t k,
                  void *dst)
 {
     size_t from = along ? at * x->ld + k0 : k0 * x->ld + at;
-    if (x->type == DAR_I8 && t->kind != DAR_TILE_I8) pack_i8(x, t, a, along, at, n, k0, k, dst);
+    if (x->type == DAR_I8) pack_i8(x, t, a, along, at, n, k0, k, dst);
     else pack_lanes(t, a, along, x->type, (const char *)x->data + from * dar_dtype_size(x->type), x->ld, n, k, dst);
 }
 
@@ -115,7 +118,7 @@ static bool lies_ready(const dar_tile *t, const dar_matrix *a, size_t k)
 static dar_operand operand_a(const dar_tile *t, const dar_matrix *a, size_t k)
 {
     bool ready = lies_ready(t, a, k);
-    return (dar_operand){ pack_a, a, ready ? a->data : NULL, ready, a->ld / t->unit };
+    return (dar_operand){ pack_a, true, a, a->data, ready, a->ld / t->unit };
 }
 
 /* ---------------------------------------------------------------- a finished tile */
@@ -198,14 +201,16 @@ static void describe(const dar_gemm *g, struct finish *f, dar_product *p)
     *p = (dar_product){ .tile = t, .m = g->m, .n = g->n, .done = finish_tile, .ctx = f };
     if (flip) {
         *p = (dar_product){ choose_tile(g->kind, g->n, g->m), g->n, g->m, .done = finish_transposed, .ctx = f };
-        p->term[0] =
-            (dar_term){ g->k, { .pack = pack_columns_a, .ctx = &g->b }, { .pack = pack_rows_b, .ctx = &g->a } };
-        p->term[1] =
-            (dar_term){ g->k2, { .pack = pack_columns_a, .ctx = &g->b2 }, { .pack = pack_rows_b, .ctx = &g->a2 } };
+        p->term[0] = (dar_term){ g->k,
+                                 { .pack = pack_columns_a, .many = true, .ctx = &g->b },
+                                 { .pack = pack_rows_b, .many = true, .ctx = &g->a } };
+        p->term[1] = (dar_term){ g->k2,
+                                 { .pack = pack_columns_a, .many = true, .ctx = &g->b2 },
+                                 { .pack = pack_rows_b, .many = true, .ctx = &g->a2 } };
         return;
     }
-    p->term[0] = (dar_term){ g->k, operand_a(t, &g->a, g->k), { .pack = pack_b, .ctx = &g->b } };
-    p->term[1] = (dar_term){ g->k2, operand_a(t, &g->a2, g->k2), { .pack = pack_b, .ctx = &g->b2 } };
+    p->term[0] = (dar_term){ g->k, operand_a(t, &g->a, g->k), { .pack = pack_b, .many = true, .ctx = &g->b } };
+    p->term[1] = (dar_term){ g->k2, operand_a(t, &g->a2, g->k2), { .pack = pack_b, .many = true, .ctx = &g->b2 } };
     if (g->type == real && !(g->add && g->alpha != 1)) {
         p->direct = true;
         p->c = g->c;

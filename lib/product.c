@@ -16,10 +16,10 @@
 #include "lib/thread.h"
 
 #define TASK_ROWS        96
-#define TASKS_PER_THREAD 8
 #define BLOCK_UNITS      512
-#define BLOCK_UNITS_THIN 256
+#define BLOCK_UNITS_THIN 128
 #define PANEL_BYTES      ((size_t)24 << 20)
+#define ALIAS            4096
 #define PIECE_BYTES      ((size_t)256 << 10) /* of B, packed by a thin task */
 #define ACC_COLS         384                 /* columns summed in scratch at a time */
 
@@ -65,7 +65,8 @@ static const dar_term *block(const struct plan *s, size_t b, size_t *k0, size_t 
     return &term[i];
 }
 
-/* Equal blocks of whole cache lines, at most `units` each. */
+/* Equal blocks of whole cache lines, about `units` at most.  Stripes are packed side by side: a whole number of pages
+ * apart, they would all want the same few lines of the first-level cache. */
 static void cut_k(struct plan *s, size_t units)
 {
     s->blocks = 0;
@@ -74,6 +75,7 @@ static void cut_k(struct plan *s, size_t units)
         size_t k = s->p->term[i].k, line = DAR_ALIGN / s->t->unit_bytes * s->t->unit;
         size_t n = ceil_div(k, units * s->t->unit);
         s->kc[i] = n ? ceil_div(ceil_div(k, n), line) * line : 1;
+        if (dar_tile_bytes_a(s->t, s->kc[i]) % ALIAS == 0) s->kc[i] += line;
         s->blocks += ceil_div(k, s->kc[i]);
         if (k && s->kc[i] / s->t->unit > s->depth) s->depth = s->kc[i] / s->t->unit;
     }
@@ -90,16 +92,16 @@ static void cut(struct plan *s, const dar_product *p)
     cut_k(s, s->thin ? BLOCK_UNITS_THIN : BLOCK_UNITS);
 
     size_t stripe_a = s->depth * t->mr * t->unit_bytes, stripe_b = s->depth * t->nr * t->unit_bytes;
-    size_t elem = t->kind == DAR_TILE_F64 ? 8 : 4, want = TASKS_PER_THREAD * threads;
+    size_t elem = t->kind == DAR_TILE_F64 ? 8 : 4;
     bool pack_a = (p->term[0].k && !p->term[0].a.in_place) || (p->term[1].k && !p->term[1].a.in_place);
+    size_t want = threads * (s->thin || pack_a ? 2 : 8); /* tasks: many even out, few pack less often */
 
     if (s->thin) {
         s->panel = s->cols;
         s->tm = 1;
-        s->piece = min(s->cols, 1 + PIECE_BYTES / stripe_b);
-        s->tn = min(s->cols, ceil_div(ceil_div(s->cols, s->piece), threads) * threads);
-        if (s->tn < want) s->tn = min(s->cols, want);
-        s->piece = min(s->piece, ceil_div(s->cols, s->tn));
+        s->tn = ceil_div(s->cols, 1 + PIECE_BYTES / stripe_b);
+        s->tn = min(s->cols, s->tn < want ? want : ceil_div(s->tn, threads) * threads);
+        s->piece = ceil_div(s->cols, s->tn);
     } else {
         size_t fit = 1 + PANEL_BYTES / (s->blocks * stripe_b);
         s->panel = ceil_div(s->cols, ceil_div(s->cols, fit));
@@ -125,28 +127,43 @@ size_t dar_product_scratch(const dar_product *p)
 
 /* ---------------------------------------------------------------- packing */
 
-/* One stripe over block b. */
-static void pack_stripe(const struct plan *s, bool of_a, size_t stripe, size_t b, void *dst)
+/* Bytes of a stripe over block b. */
+static size_t stripe_bytes(const struct plan *s, bool of_a, size_t b)
+{
+    size_t k0, k;
+    block(s, b, &k0, &k);
+    return of_a ? dar_tile_bytes_a(s->t, k) : dar_tile_bytes_b(s->t, k);
+}
+
+/* Stripes [begin, end) over block b. */
+static void pack(const struct plan *s, bool of_a, size_t begin, size_t end, size_t b, char *dst)
 {
     size_t k0, k, wide = of_a ? s->t->mr : s->t->nr, lanes = of_a ? s->p->m : s->p->n;
     const dar_term *term = block(s, b, &k0, &k);
     const dar_operand *x = of_a ? &term->a : &term->b;
-    if (k && !x->in_place) x->pack(x->ctx, s->t, stripe * wide, min(lanes - stripe * wide, wide), k0, k, dst);
+    size_t step = x->many ? end - begin : 1, bytes = stripe_bytes(s, of_a, b);
+
+    if (!k || x->in_place) return;
+    for (size_t i = begin; i < end; i += step, dst += bytes * step) {
+        size_t at = i * wide, last = min(lanes, (i + step) * wide);
+        x->pack(x->ctx, s->t, at, last - at, k0, k, dst);
+    }
 }
 
-/* Where the shared stripe `at` (of B in this panel; thin: of A) lies. */
-static char *shared_stripe(const struct plan *s, size_t b, size_t at)
+/* The shared stripes of block b: of B in this panel, or if thin of A. */
+static char *shared_block(const struct plan *s, size_t b)
 {
     size_t stripes = s->thin ? s->rows : s->panel, wide = s->thin ? s->t->mr : s->t->nr;
-    return s->shared + (b * stripes + at) * s->depth * wide * s->t->unit_bytes;
+    return s->shared + b * stripes * s->depth * wide * s->t->unit_bytes;
 }
 
-static void pack_shared(void *ctx, size_t i, int thread)
+static void pack_shared(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct plan *s = ctx;
+    size_t first = s->thin ? 0 : s->first;
     (void)thread;
     for (size_t b = 0; b < s->blocks; b++)
-        pack_stripe(s, s->thin, s->thin ? i : s->first + i, b, shared_stripe(s, b, i));
+        pack(s, s->thin, first + begin, first + end, b, shared_block(s, b) + begin * stripe_bytes(s, s->thin, b));
 }
 
 /* ---------------------------------------------------------------- multiplying */
@@ -169,15 +186,17 @@ static char *sum_at(const struct plan *s, const struct task *w, size_t i, size_t
 static void multiply_block(const struct plan *s, const struct task *w, size_t b)
 {
     const dar_tile *t = s->t;
-    size_t k0, k, stripe_a = s->depth * t->mr * t->unit_bytes, stripe_b = s->depth * t->nr * t->unit_bytes, ldc;
+    size_t k0, k, stripe_a = stripe_bytes(s, true, b), stripe_b = stripe_bytes(s, false, b), ldc;
     const dar_operand *a = &block(s, b, &k0, &k)->a;
+    const char *as = s->thin ? shared_block(s, b) + w->r0 * stripe_a : w->a;
+    const char *bs = s->thin ? w->b : shared_block(s, b) + (w->c0 - s->first) * stripe_b;
     bool add = b || (s->p->direct && s->p->add), last = b + 1 == s->blocks;
 
     for (size_t j = w->c0; j < w->c1; j++) {
-        const char *pb = s->thin ? w->b + (j - w->c0) * stripe_b : shared_stripe(s, b, j - s->first);
+        const char *pb = bs + (j - w->c0) * stripe_b;
         size_t n = min(s->p->n - j * t->nr, t->nr);
         for (size_t i = w->r0; i < w->r1; i++) {
-            const char *pa = s->thin ? shared_stripe(s, b, i) : w->a + (i - w->r0) * stripe_a;
+            const char *pa = as + (i - w->r0) * stripe_a;
             size_t m = min(s->p->m - i * t->mr, t->mr), a_row = 1, a_k = t->mr;
             char *c = sum_at(s, w, i, j, &ldc);
             if (a->in_place) {
@@ -193,7 +212,6 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
 static void multiply(void *ctx, size_t i, int thread)
 {
     const struct plan *s = ctx;
-    const dar_tile *t = s->t;
     char *own = s->own + (size_t)thread * (s->a_bytes + s->b_bytes + s->c_bytes);
     size_t r = i / s->tn, c = i % s->tn, panel = min(s->panel, s->cols - s->first);
     struct task w = { .a = own, .b = own + s->a_bytes, .c = own + s->a_bytes + s->b_bytes };
@@ -204,10 +222,8 @@ static void multiply(void *ctx, size_t i, int thread)
     for (w.c0 = s->first + panel * c / s->tn; w.c0 < end; w.c0 = w.c1) {
         w.c1 = min(w.c0 + s->piece, end);
         for (size_t b = 0; b < s->blocks; b++) {
-            for (size_t j = w.c0; s->thin && j < w.c1; j++)
-                pack_stripe(s, false, j, b, w.b + (j - w.c0) * s->depth * t->nr * t->unit_bytes);
-            for (size_t j = w.r0; !s->thin && j < w.r1; j++)
-                pack_stripe(s, true, j, b, w.a + (j - w.r0) * s->depth * t->mr * t->unit_bytes);
+            if (s->thin) pack(s, false, w.c0, w.c1, b, w.b);
+            else pack(s, true, w.r0, w.r1, b, w.a);
             multiply_block(s, &w, b);
         }
     }
@@ -221,12 +237,13 @@ void dar_product_run(const dar_product *p, void *scratch)
     s.shared = scratch;
     s.own = s.shared + s.shared_bytes;
     if (s.thin) {
-        dar_parallel(s.rows, pack_shared, &s);
+        dar_parallel_range(s.rows, 1, pack_shared, &s);
         dar_parallel(s.tn, multiply, &s);
         return;
     }
     for (; s.first < s.cols; s.first += s.panel) {
-        dar_parallel(min(s.panel, s.cols - s.first), pack_shared, &s);
+        size_t panel = min(s.panel, s.cols - s.first);
+        dar_parallel_range(panel, 1 + panel / (8 * (size_t)dar_threads()), pack_shared, &s);
         dar_parallel(s.tm * s.tn, multiply, &s);
     }
 }

@@ -16,10 +16,12 @@
 
 /* A: lanes are rows of C.  B: lanes are columns. */
 typedef struct dar_operand {
-    /* Write lanes [at, at + n) over elements [k0, k0 + k) of the sum as one packed stripe of t, mr or nr wide, filled
-     * up with zeros (dar_tile_pack_* do).  `at` is a multiple of that width, k0 of the unit.  Runs on any thread; a
-     * stripe of B is asked for once per block of k, in ascending k, by one thread. */
+    /* Write lanes [at, at + n) over elements [k0, k0 + k) of the sum as a packed stripe of t, mr or nr wide, filled up
+     * with zeros; if `many`, n may be more: as stripes one after the other (dar_tile_pack_* do either).  `at` is a
+     * multiple of the width, k0 of the unit.  Runs on any thread; each lane of B is asked for once per block of k, in
+     * ascending k, by one thread. */
     void (*pack)(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *stripes);
+    bool many;
     const void *ctx;
 
     /* A only: it lies in memory as the tile reads it, unit (i, k) at units + i * row + k [units], and is not packed.  k

@@ -129,9 +129,19 @@ static void pack(const dar_tile *t, bool along, dar_dtype src_type, const void *
                  size_t wide, void *dst)
 {
     dar_pack_fn *fn = t->pack ? (along ? t->pack->along : t->pack->across)[src_type] : NULL;
+    size_t stripe = dar_tile_units(t, k) * wide * t->unit_bytes, lane = along ? ld : 1, step = along ? 1 : ld;
 
-    if (fn) fn(src, ld, lanes, k, wide, dst);
-    else pack_slow(t, src_type, src, along ? ld : 1, along ? 1 : ld, lanes, k, wide, dst);
+    if (fn && !along) {
+        fn(src, ld, lanes, k, wide, dst);
+        return;
+    }
+    for (size_t j = 0; j < lanes; j += wide) {
+        const char *from = (const char *)src + j * lane * dar_dtype_size(src_type);
+        char *to = (char *)dst + j / wide * stripe;
+        size_t n = lanes - j < wide ? lanes - j : wide;
+        if (fn) fn(from, ld, n, k, wide, to);
+        else pack_slow(t, src_type, from, lane, step, n, k, wide, to);
+    }
 }
 
 void dar_tile_pack_a_mk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,

@@ -24,7 +24,7 @@
 
 typedef enum dar_tile_kind { DAR_TILE_F64, DAR_TILE_F32, DAR_TILE_BF16, DAR_TILE_I8, DAR_TILE_KINDS } dar_tile_kind;
 
-/* Pack `lanes` lanes of k elements into a stripe of `wide` lanes; see dar_tile_pack_*. */
+/* Pack `lanes` lanes of k elements into stripes of `wide` lanes; see dar_tile_pack_*.  Along k: one stripe. */
 typedef void dar_pack_fn(const void *src, size_t ld, size_t lanes, size_t k, size_t wide, void *dst);
 
 typedef struct dar_packers {
@@ -62,9 +62,9 @@ size_t dar_tile_units(const dar_tile *t, size_t k);
 size_t dar_tile_bytes_a(const dar_tile *t, size_t k);
 size_t dar_tile_bytes_b(const dar_tile *t, size_t k);
 
-/* Pack one stripe, converting from the stored type; the rest of the stripe (rows past m, columns past n, k to a whole
- * unit) is zero.  `ld` is the distance between stored rows [elements].  Sources: f64, f32, bf16, f16 for the float
- * kinds; bytes (DAR_I8) for DAR_TILE_I8.
+/* Pack, converting from the stored type: one stripe, or where m > mr or n > nr several, one after the other.  The rest
+ * of the last stripe (rows past m, columns past n, k to a whole unit) is zero.  `ld` is the distance between stored
+ * rows [elements].  Sources: f64, f32, bf16, f16 for the float kinds; bytes (DAR_I8) for DAR_TILE_I8.
  *
  *   a_mk: src[m][k]    a_km: src[k][m] (A is stored transposed)
  *   b_kn: src[k][n]    b_nk: src[n][k] (B is stored transposed: weights [out, in]) */
