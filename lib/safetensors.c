@@ -77,7 +77,7 @@ static dar_status check_text(const char *name, const char *text, size_t n, dar_e
         else if (string && c == '\\') i++;
         else if (!string && (!c || !strchr("{}[]:,0123456789 \n\r\t", c)))
             return dar_fail(e, DAR_ERR_FORMAT, "%s: byte %zu of the header is '%c', expected a plain integer or string",
-                            name, i, c);
+                            name, i, (unsigned char)c < 0x80 ? c : '?');
         else if (!string && c == ',' && ++commas > COMMAS)
             return dar_fail(e, DAR_ERR_FORMAT, "%s: the header has more than %d values", name, COMMAS);
     }

@@ -10,10 +10,10 @@
 #include "lib/status.h"
 #include "lib/tensor.h"
 
+/* x is contiguous and has no dimension 0.  Of i8 the bytes alone are written: its scales are an item of their own. */
 typedef struct dar_safetensors_item {
     const char *name;
-    dar_tensor
-        x; /* contiguous, no dimension 0; of i8 the bytes alone are written: its scales are an item of their own */
+    dar_tensor x;
 } dar_safetensors_item;
 
 typedef struct dar_safetensors_options {
@@ -22,8 +22,8 @@ typedef struct dar_safetensors_options {
 } dar_safetensors_options;
 
 /* Write n tensors to `path`, conventionally *.safetensors.  If they need more than one shard, they go to
- * STEM-00001-of-0000K.safetensors and STEM.safetensors.index.json instead; whichever of the two forms was there before
- * under this name is removed, so that the name means one thing.
+ * STEM-00001-of-0000K.safetensors and STEM.safetensors.index.json instead.  The other form, file or index, is removed
+ * if it was there, so that the name means one thing; shards of an older index stay.
  *
  * Data begins at a multiple of 64 bytes, larger elements first, so every tensor is aligned to its element.  Same
  * tensors, same bytes.  Aborts if a name is not one the reader takes (safetensors.h) or comes twice.  `o` may be NULL.
