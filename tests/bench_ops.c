@@ -217,6 +217,40 @@ static const bench_kind transpose = { .part = { "transpose" },
                                       .inputs = one,
                                       .call = call_transpose };
 
+/* ---------------------------------------------------------------- linear layers: tokens, outputs, inputs, rank */
+
+static void layer(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[0], b->s[2]), true);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1], b->s[2]), true);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1]), true);
+}
+
+static dar_val *call_linear(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_linear(t, x[0], x[1], x[2], &(dar_linear_opt){ .act = DAR_ACT_GELU_TANH });
+}
+
+/* Base weights frozen, as they are in training. */
+static void layer_with_rank(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[0], b->s[2]), true);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1], b->s[2]), false);
+    bench_input(b, b->row->type, DAR_SHAPE(b->s[1]), false);
+    bench_input(b, DAR_F32, DAR_SHAPE(b->s[3], b->s[2]), true);
+    bench_input(b, DAR_F32, DAR_SHAPE(b->s[1], b->s[3]), true);
+}
+
+static dar_val *call_lora(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_lora(t, x[0], x[1], x[2], x[3], x[4], 1, NULL);
+}
+
+static const bench_kind linear_gelu = { BENCH_OP(linear), .inputs = layer, .call = call_linear };
+static const bench_kind lora = { BENCH_OP(lora), .inputs = layer_with_rank, .call = call_lora };
+
 /* ---------------------------------------------------------------- attention: tokens, heads, head size */
 
 static void queries_keys_values(bench *b)
@@ -273,10 +307,17 @@ static const bench_kind conv3d = { BENCH_OP(conv3d), .inputs = clip, .call = cal
     }
 #define ATTN(...)         BOTH(attention, BENCH_F32, BENCH_BF16, 0.80, 0.68, __VA_ARGS__)
 #define CONV(kind, ...)   BOTH(kind, BENCH_F32, BENCH_BF16, 0.70, 0.70, __VA_ARGS__)
+#define LINEAR(kind, ...) BOTH(kind, BENCH_F32, BENCH_BF16, 0, 0, __VA_ARGS__)
 #define STREAM(kind, ...) BOTH(kind, BENCH_COPY, BENCH_COPY, 0.80, 0.80, __VA_ARGS__)
 #define PLAIN(kind, ...)  BOTH(kind, BENCH_COPY, BENCH_COPY, 0, 0, __VA_ARGS__)
 
 const bench_row bench_op_rows[] = {
+    LINEAR(linear_gelu, 2048, 1536, 384),
+    LINEAR(linear_gelu, 2048, 3072, 3072),
+    LINEAR(lora, 2048, 384, 384, 32),
+    LINEAR(lora, 2048, 3072, 3072, 32),
+    LINEAR(lora, 2048, 3072, 3072, 256),
+
     ATTN(1536, 6, 64),
     ATTN(2048, 24, 128),
     ATTN(8192, 24, 128),
