@@ -4,6 +4,7 @@
 #include <cblas.h>
 #include <string.h>
 
+#include "lib/arena.h"
 #include "lib/cpu.h"
 #include "lib/kern.h"
 #include "lib/product.h"
@@ -58,6 +59,7 @@ static void pack_i8(const dar_matrix *x, const dar_tile *t, bool a, bool along, 
 {
     float buf[BLAS_COLS * PIECE];
     size_t wide = a ? t->mr : t->nr, end = at + n;
+    void (*dequantise)(size_t, const int8_t *, float, void *) = dar_kern_for(DAR_F32)->dequantise;
     DAR_ASSERT(wide <= BLAS_COLS, "gemm: a stripe of %zu", wide);
     for (; at < end; at += wide)
         for (size_t p = 0; p < k; p += PIECE) {
@@ -66,8 +68,7 @@ static void pack_i8(const dar_matrix *x, const dar_tile *t, bool a, bool along, 
             size_t row0 = along ? at : k0 + p, col0 = along ? k0 + p : at;
             for (size_t i = 0; i < rows; i++) {
                 const int8_t *q = (const int8_t *)x->data + (row0 + i) * x->ld + col0;
-                float s = x->scale[row0 + i];
-                for (size_t j = 0; j < cols; j++) buf[i * cols + j] = s * q[j];
+                dequantise(cols, q, x->scale[row0 + i], buf + i * cols);
             }
             pack_lanes(t, a, along, DAR_F32, buf, cols, lanes, kn, dst);
             dst += dar_tile_units(t, kn) * wide * t->unit_bytes;
@@ -93,6 +94,13 @@ static void pack_b(const void *ctx, const dar_tile *t, size_t at, size_t n, size
 {
     const dar_matrix *x = ctx;
     pack(x, t, false, x->t, at, n, k0, k, dst);
+}
+
+/* W, stored [n, k] in 8 bits, for an 8-bit tile. */
+static void pack_w(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *dst)
+{
+    const dar_matrix *x = ctx;
+    dar_tile_pack_b_nk(t, DAR_I8, (const int8_t *)x->data + at * x->ld + k0, x->ld, k, n, dst);
 }
 
 /* The same for the transposed product: B's columns are the rows of C^T. */
@@ -154,7 +162,8 @@ static void finish_row(const struct finish *f, size_t i, size_t j, size_t n, voi
     }
     if (f->pre) memcpy((char *)f->pre + (i * f->n + j) * size, x, n * size);
     if (f->act) f->act(n, x, x);
-    dar_row_put(f->real, x, f->type, (char *)f->c + (i * f->ldc + j) * dar_dtype_size(f->type), n, f->add);
+    dar_row_put(f->real, x, f->type, (char *)f->c + (i * f->ldc + j) * dar_dtype_size(f->type), n,
+                f->add ? DAR_PUT_ADD : DAR_PUT);
 }
 
 static void finish_tile(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
@@ -234,11 +243,105 @@ void dar_gemm_run(const dar_gemm *g, void *scratch)
     struct finish f;
     dar_product p;
 
-    DAR_ASSERT(g->kind != DAR_TILE_I8 && (g->type == DAR_F64) == (g->kind == DAR_TILE_F64) && g->type != DAR_I8,
+    DAR_ASSERT(g->kind != DAR_TILE_I8 && (g->type != DAR_F64 || g->kind == DAR_TILE_F64) && g->type != DAR_I8,
                "gemm: C of type %s from tiles of kind %d", dar_dtype_name(g->type), (int)g->kind);
     DAR_ASSERT(!g->add || !(g->bias || g->pre || g->act), "gemm: add with bias, pre or act");
     describe(g, &f, &p);
     /* OpenBLAS starts threads where it thinks it is alone; inside a task it does not. */
     if ((p.tile == &blas_f64 || p.tile == &blas_f32) && !dar_in_task()) openblas_set_num_threads(1);
     dar_product_run(&p, scratch);
+}
+
+/* ---------------------------------------------------------------- 8 bits */
+
+/* Activations are stored as q + 128, so that tiles multiply u8 by s8: sum (q + 128) w = sum q w + 128 sum w. */
+struct i8 {
+    const dar_gemm_i8 *g;
+    struct finish f;
+    uint8_t *q;      /* [m, row] */
+    size_t row;      /* k in whole units */
+    float *scale;    /* [m] */
+    int32_t *offset; /* [n]: 128 sum w */
+    dar_matrix a, b;
+};
+
+static void quantise_rows(void *ctx, size_t begin, size_t end, int thread)
+{
+    const struct i8 *s = ctx;
+    size_t k = s->g->k;
+    (void)thread;
+    for (size_t i = begin; i < end; i++) {
+        const char *x = (const char *)s->g->a + i * s->g->lda * dar_dtype_size(s->g->a_type);
+        uint8_t *q = s->q + i * s->row;
+        s->scale[i] = dar_row_quantise(s->g->a_type, x, k, (int8_t *)q);
+        for (size_t j = 0; j < k; j++) q[j] ^= 128;
+        memset(q + k, 0, s->row - k);
+    }
+}
+
+static void sum_rows(void *ctx, size_t begin, size_t end, int thread)
+{
+    const struct i8 *s = ctx;
+    (void)thread;
+    for (size_t j = begin; j < end; j++) {
+        const int8_t *w = s->g->w + j * s->g->k;
+        int32_t sum = 0;
+        for (size_t p = 0; p < s->g->k; p++) sum += w[p];
+        s->offset[j] = 128 * sum;
+    }
+}
+
+static void finish_i8(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
+{
+    const struct i8 *s = ctx;
+    const int32_t *offset = s->offset + j;
+    const float *w_scale = s->g->w_scale + j;
+    float row[BLAS_COLS];
+    for (size_t r = 0; r < m; r++) {
+        const int32_t *sum = (const int32_t *)c + r * ldc;
+        float scale = s->scale[i + r];
+        for (size_t q = 0; q < n; q++) row[q] = (float)(sum[q] - offset[q]) * (scale * w_scale[q]);
+        finish_row(&s->f, i + r, j, n, row);
+    }
+}
+
+/* Returns the bytes of scratch in front of the product's own. */
+static size_t describe_i8(const dar_gemm_i8 *g, struct i8 *s, dar_product *p, char *scratch)
+{
+    const dar_tile *t = dar_tile_fit(DAR_TILE_I8, g->m, g->n);
+    size_t row = (g->k + DAR_ALIGN - 1) / DAR_ALIGN * DAR_ALIGN;
+    size_t scale = g->m * row, offset = scale + g->m * sizeof(float), end = offset + g->n * sizeof(int32_t);
+
+    *s = (struct i8){ .g = g, .row = row };
+    s->f = (struct finish){ 1, DAR_F32, g->type, g->c, g->ldc, g->n, false, g->bias, g->bias_type, g->pre, g->act };
+    if (scratch) {
+        s->q = (uint8_t *)scratch;
+        s->scale = (float *)(void *)(scratch + scale);
+        s->offset = (int32_t *)(void *)(scratch + offset);
+    }
+    s->a = (dar_matrix){ DAR_I8, s->q, row, false, NULL };
+    s->b = (dar_matrix){ DAR_I8, g->w, g->k, true, NULL };
+    *p = (dar_product){ .tile = t, .m = g->m, .n = g->n, .done = finish_i8, .ctx = s };
+    p->term[0] = (dar_term){ row, operand_a(t, &s->a, row), { .pack = pack_w, .many = true, .ctx = &s->b } };
+    p->term[0].k = g->k;
+    return (end + DAR_ALIGN - 1) / DAR_ALIGN * DAR_ALIGN;
+}
+
+size_t dar_gemm_i8_scratch(const dar_gemm_i8 *g)
+{
+    struct i8 s;
+    dar_product p;
+    size_t own = describe_i8(g, &s, &p, NULL);
+    return own + dar_product_scratch(&p);
+}
+
+void dar_gemm_i8_run(const dar_gemm_i8 *g, void *scratch)
+{
+    struct i8 s;
+    dar_product p;
+    DAR_ASSERT(g->k <= 65536, "gemm: %zu products of 8 bits do not fit a 32-bit sum", g->k);
+    size_t own = describe_i8(g, &s, &p, scratch);
+    dar_parallel_range(g->m, 8, quantise_rows, &s);
+    dar_parallel_range(g->n, 16, sum_rows, &s);
+    dar_product_run(&p, (char *)scratch + own);
 }

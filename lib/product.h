@@ -24,8 +24,8 @@ typedef struct dar_operand {
     bool many;
     const void *ctx;
 
-    /* A only: it lies in memory as the tile reads it, unit (i, k) at units + i * row + k [units], and is not packed.  k
-     * is then a multiple of the unit. */
+    /* A only: it lies in memory as the tile reads it, unit (i, k) at units + i * row + k [units], and is not packed.
+     * Whole units are read: past k they hold zeros, or B's stripe does. */
     const void *units;
     bool in_place;
     size_t row;

@@ -5,6 +5,7 @@
 #include <sys/mman.h>
 
 #include "lib/gemm.h"
+#include "lib/kern.h"
 #include "lib/tensor.h"
 
 #define CANARY 0x7b
@@ -256,6 +257,42 @@ static void threads(void)
     dar_threads_set(old);
 }
 
+/* 8 bits times 8 bits: the integers are exact, so only the two scalings and what follows are rounded. */
+static void eight_bits(void)
+{
+    static const size_t shape[][3] = { { 1, 1, 1 }, { 7, 9, 31 }, { 33, 65, 129 }, { 130, 70, 2100 }, { 101, 17, 64 } };
+    for (size_t s = 0; s < DAR_COUNT(shape); s++)
+        for (int v = 0; v < 4; v++) {
+            dar_mark mark = dar_arena_mark(&arena);
+            dar_gemm_i8 g = { .m = shape[s][0], .n = shape[s][1], .k = shape[s][2], .type = DAR_F32 };
+            g.a_type = v & 1 ? DAR_BF16 : DAR_F32;
+            g.lda = g.k + 2;
+            g.ldc = g.n + 1;
+            const char *a = g.a = push_random(g.a_type, g.m * g.lda);
+            const int8_t *w = g.w = push_random(DAR_I8, g.n * g.k);
+            float *ws = push_random(DAR_F32, g.n), *c = dar_arena_push(&arena, g.m * g.ldc * sizeof(float));
+            int8_t *q = dar_arena_push(&arena, g.k);
+            float *bias = v & 2 ? push_random(DAR_F32, g.n) : NULL;
+            g.w_scale = ws;
+            g.c = c;
+            g.bias = bias;
+            g.bias_type = DAR_F32;
+            for (size_t i = 0; i < g.m; i++) c[i * g.ldc + g.n] = 7;
+            dar_gemm_i8_run(&g, dar_arena_push(&arena, dar_gemm_i8_scratch(&g)));
+            for (size_t i = 0; i < g.m; i++) {
+                float scale = dar_row_quantise(g.a_type, a + i * g.lda * dar_dtype_size(g.a_type), g.k, q);
+                for (size_t j = 0; j < g.n; j++) {
+                    int64_t sum = 0;
+                    for (size_t p = 0; p < g.k; p++) sum += q[p] * w[j * g.k + p];
+                    double ab = (double)sum * scale * ws[j], b = bias ? bias[j] : 0;
+                    CHECK_NEAR("8 bits", c[i * g.ldc + j], ab + b, FLT_EPSILON * (2 * fabs(ab) + fabs(ab + b)));
+                }
+                CHECK(c[i * g.ldc + g.n] == 7, "8 bits: wrote past row %zu", i);
+            }
+            dar_arena_reset(&arena, mark);
+        }
+}
+
 static void small_shapes(void **state)
 {
     (void)state;
@@ -272,6 +309,12 @@ static void finished_tiles(void **state)
 {
     (void)state;
     each_level(finishing);
+}
+
+static void eight_bit_products(void **state)
+{
+    (void)state;
+    each_level(eight_bits);
 }
 
 static void any_threads(void **state)
@@ -312,8 +355,8 @@ static void far_rows(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(small_shapes), cmocka_unit_test(medium_shapes), cmocka_unit_test(finished_tiles),
-        cmocka_unit_test(any_threads),  cmocka_unit_test(far_rows),
+        cmocka_unit_test(small_shapes),       cmocka_unit_test(medium_shapes), cmocka_unit_test(finished_tiles),
+        cmocka_unit_test(eight_bit_products), cmocka_unit_test(any_threads),   cmocka_unit_test(far_rows),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
