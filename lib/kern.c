@@ -4,7 +4,6 @@
 #include <math.h>
 #include <stdatomic.h>
 #include <string.h>
-#include <unistd.h>
 
 #include "lib/cpu.h"
 #include "lib/kern_sets.h"
@@ -12,12 +11,9 @@
 #include "lib/thread.h"
 
 static dar_kern f32, f64;
-static size_t last_level = (size_t)32 << 20; /* [byte] of cache; this where the system does not say */
 
 void dar_kern_init(unsigned cpu_flags)
 {
-    long cache = sysconf(_SC_LEVEL3_CACHE_SIZE);
-    if (cache > 0) last_level = (size_t)cache;
     dar_kern_ref_f32(&f32); /* every slot filled first, then better ones over them */
     dar_kern_ref_f64(&f64);
     if (cpu_flags & DAR_CPU_AVX2) dar_kern_avx2(&f32);
@@ -38,10 +34,12 @@ dar_dtype dar_compute_type(dar_dtype storage)
 
 /* ---------------------------------------------------------------- storage */
 
+/* What systems report as the last-level cache is the whole machine's: a slice of it is what a few cores can use. */
+#define CACHED ((size_t)24 << 20)
+
 dar_put dar_put_for(size_t bytes, bool add)
 {
-    dar_cpu_flags();
-    return add ? DAR_PUT_ADD : bytes > last_level ? DAR_PUT_STREAM : DAR_PUT;
+    return add ? DAR_PUT_ADD : bytes > CACHED ? DAR_PUT_STREAM : DAR_PUT;
 }
 
 void dar_row_convert(dar_dtype dst_type, void *dst, dar_dtype src_type, const void *src, size_t n)

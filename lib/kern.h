@@ -22,10 +22,15 @@
 #include "lib/dtype.h"
 
 /* Normalisation of one row: xhat = (x - mean) rstd, y = xhat w + b.  w NULL: 1; b NULL: 0.  The mean is subtracted in
- * two parts, so that rows far from zero keep every bit they have; RMS norm is the same with mean 0. */
+ * two parts, so that rows far from zero keep every bit they have; RMS norm is the same with mean 0.
+ *
+ * A row is read twice, the second time from the cache; memory would stand idle meanwhile.  So norm and norm_back ask
+ * for what will be read next: ahead[0], ahead[1] (NULL: nothing), ahead_size bytes per element of this row. */
 typedef struct dar_norm {
     double mean, rstd;
     const void *w, *b;
+    const void *ahead[2];
+    size_t ahead_size[2];
 } dar_norm;
 
 /* One step of AdamW.  m = beta1 m + (1 - beta1) g scale, v likewise of squares,
@@ -106,8 +111,8 @@ dar_dtype dar_compute_type(dar_dtype storage);
 /* How a row is stored: over what is there, added to it, or past the caches. */
 typedef enum dar_put { DAR_PUT, DAR_PUT_ADD, DAR_PUT_STREAM } dar_put;
 
-/* The mode for an output of `bytes` in all: add if asked; stream what is larger than the last-level cache, where the
- * next reader would not find it anyway. */
+/* The mode for an output of `bytes` in all: add if asked; stream what is larger than the caches, where the next reader
+ * would not find it anyway. */
 dar_put dar_put_for(size_t bytes, bool add);
 
 /* n elements at src as arithmetic type c (f32 or f64): src itself if it is stored so, else converted into buf. */

@@ -3,7 +3,7 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define CHUNK (16 * DAR_PIECE) /* elements per task */
+#define CHUNK (64 * DAR_PIECE) /* elements per task */
 
 struct act {
     const dar_opctx *c;
@@ -28,7 +28,6 @@ static void forward_range(void *ctx, size_t begin, size_t end, int thread)
     for (size_t i = begin; i < end; i += DAR_PIECE) {
         size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
         void *to = dar_row_out(a->type, y->dtype, dar_tensor_at(y, i), a->mode, buf);
-        dar_row_ahead(dar_tensor_at(x, i + n), n * dar_dtype_size(x->dtype));
         a->fn(n, dar_row_get(a->type, x->dtype, dar_tensor_at(x, i), n, buf), to);
         dar_row_put(a->type, to, y->dtype, dar_tensor_at(y, i), n, a->mode);
     }
@@ -43,8 +42,6 @@ static void backward_range(void *ctx, size_t begin, size_t end, int thread)
     for (size_t i = begin; i < end; i += DAR_PIECE) {
         size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
         void *to = dar_row_out(a->type, gx->dtype, dar_tensor_at(gx, i), a->mode, buf);
-        dar_row_ahead(dar_tensor_at(x, i + n), n * dar_dtype_size(x->dtype));
-        dar_row_ahead(dar_tensor_at(gy, i + n), n * dar_dtype_size(gy->dtype));
         a->back(n, dar_row_get(a->type, x->dtype, dar_tensor_at(x, i), n, buf), dar_tensor_at(gy, i), to);
         dar_row_put(a->type, to, gx->dtype, dar_tensor_at(gx, i), n, a->mode);
     }

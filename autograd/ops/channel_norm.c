@@ -63,7 +63,6 @@ static void *place(const struct walk *w, const struct block *b, const dar_tensor
 
 static const void *get(const struct walk *w, const struct block *b, const dar_tensor *x, size_t channel, void *buf)
 {
-    if (channel + 1 < w->channels) dar_row_ahead(place(w, b, x, channel + 1), b->n * dar_dtype_size(x->dtype));
     return dar_row_get(w->type, x->dtype, place(w, b, x, channel), b->n, buf);
 }
 

@@ -6,7 +6,7 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define CHUNK 32768 /* elements per task of forward */
+#define CHUNK 65536 /* elements per task of forward */
 
 enum { X, U, G };
 
@@ -68,8 +68,6 @@ static void forward_rows(void *ctx, size_t begin, size_t end, int thread)
             const void *xs = dar_row_get(w->type, x->dtype, dar_tensor_at(x, i), n, xbuf);
             const void *us = dar_row_get(w->type, u->dtype, dar_tensor_at(u, i), n, ubuf);
             void *to = dar_row_out(w->type, y->dtype, dar_tensor_at(y, i), w->mode[0], xbuf);
-            dar_row_ahead(dar_tensor_at(x, i + n), n * dar_dtype_size(x->dtype));
-            dar_row_ahead(dar_tensor_at(u, i + n), n * dar_dtype_size(u->dtype));
             w->k->mul_add(n, gate_at(w, group, j), us, xs, to);
             dar_row_put(w->type, to, y->dtype, dar_tensor_at(y, i), n, w->mode[0]);
         }
@@ -92,11 +90,9 @@ static void backward_piece(const struct walk *w, size_t row, size_t j, size_t gr
     double gbuf[DAR_PIECE], ubuf[DAR_PIECE];
     const void *g = dar_row_get(w->type, gy->dtype, dar_tensor_at(gy, i), n, gbuf);
 
-    dar_row_ahead(dar_tensor_at(gy, i + n), n * dar_dtype_size(gy->dtype));
     if (gx->data) dar_row_put(w->type, g, gx->dtype, dar_tensor_at(gx, i), n, w->mode[0]);
     if (part) {
         void *sum = part + j * dar_dtype_size(w->type);
-        dar_row_ahead(dar_tensor_at(u, i + n), n * dar_dtype_size(u->dtype));
         w->k->mul_add(n, dar_row_get(w->type, u->dtype, dar_tensor_at(u, i), n, ubuf), g, sum, sum);
     }
     if (gu->data) {

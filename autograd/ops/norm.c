@@ -11,7 +11,7 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define CHUNK 32768 /* elements per task of forward */
+#define CHUNK 131072 /* elements per task of forward */
 
 enum { X, GAIN, SHIFT };
 
@@ -38,7 +38,7 @@ struct walk {
     double eps;
     dar_put mode; /* of y or gx */
 
-    /* Offsets into scratch; 0 is that of the threads' rows, three for each, so 0 elsewhere says: not there. */
+    /* Offsets into scratch; 0 is that of the threads' rows, two for each, so 0 elsewhere says: not there. */
     size_t gain, shift; /* [groups, D] */
     size_t part[2];     /* [chunks, D]: partial sums for the gradients of gain and shift */
     size_t scratch;     /* in all */
@@ -57,7 +57,7 @@ static struct walk walk_of(const dar_opctx *c, const struct kind *kind, bool bac
     else w.groups = dar_groups_of(1, dar_tensor_rows(&c->x[X]), 1, 0, w.d);
 
     size_t weights = dar_mul_size(w.groups.clips * w.groups.rows, w.row);
-    w.scratch = dar_mul_size(3 * (size_t)c->threads, w.row);
+    w.scratch = dar_mul_size(2 * (size_t)c->threads, w.row);
     if (gain->n >= 0) w.gain = w.scratch, w.scratch = dar_add_size(w.scratch, weights);
     if (c->x[SHIFT].shape.n >= 0 && !backward) w.shift = w.scratch, w.scratch = dar_add_size(w.scratch, weights);
     for (int i = 0; backward && i < 2; i++)
@@ -73,10 +73,10 @@ static void *at(const struct walk *w, size_t offset)
     return (char *)w->c->scratch + offset;
 }
 
-/* Row i of three that belong to this thread. */
+/* Row i of two that belong to this thread. */
 static void *own_row(const struct walk *w, int thread, int i)
 {
-    return at(w, (size_t)(3 * thread + i) * w->row);
+    return at(w, (size_t)(2 * thread + i) * w->row);
 }
 
 /* Gains and shifts in the arithmetic type. */
@@ -105,22 +105,50 @@ static void save(const struct walk *w, size_t row, const dar_norm *p)
     if (w->c->aux.data) dar_row_convert(w->type, dar_tensor_at(&w->c->aux, row * STATS), DAR_F64, s, STATS);
 }
 
+/* Elements of the piece of a row that starts at column j. */
+static size_t piece(const struct walk *w, size_t j)
+{
+    return w->d - j < DAR_PIECE ? w->d - j : DAR_PIECE;
+}
+
+/* The weights of a piece of which p has those of the row. */
+static dar_norm piece_of(const struct walk *w, const dar_norm *p, size_t j)
+{
+    size_t skip = j * dar_dtype_size(w->type);
+    dar_norm q = *p;
+    if (q.w) q.w = (const char *)q.w + skip;
+    if (q.b) q.b = (const char *)q.b + skip;
+    return q;
+}
+
+/* Ask for what row i + 1 of x has where row i has its piece at column j. */
+static void ask(const struct walk *w, dar_norm *p, int which, const dar_tensor *x, size_t i, size_t j)
+{
+    p->ahead[which] = dar_tensor_at(x, (i + 1) * w->d + j);
+    p->ahead_size[which] = dar_dtype_size(x->dtype);
+}
+
 static void forward_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct walk *w = ctx;
     const dar_tensor *x = &w->c->x[X], *y = &w->c->y;
-    size_t d = w->d;
+    size_t d = w->d, size = dar_dtype_size(w->type);
+    double buf[DAR_PIECE];
 
     for (size_t i = begin; i < end; i++) {
         dar_norm p = { 0 };
-        const void *from = dar_row_get(w->type, x->dtype, dar_tensor_at(x, i * d), d, own_row(w, thread, 0));
-        if (i + 1 < end) dar_row_ahead(dar_tensor_at(x, (i + 1) * d), d * dar_dtype_size(x->dtype));
+        const char *from = dar_row_get(w->type, x->dtype, dar_tensor_at(x, i * d), d, own_row(w, thread, 0));
         if (w->kind->centred) p.mean = w->k->sum(d, from) / (double)d;
         p.rstd = 1 / sqrt(w->k->sum_sq(d, from, p.mean) / (double)d + w->eps);
         set_weights(w, dar_group_of(&w->groups, i), &p);
-        void *to = dar_row_out(w->type, y->dtype, dar_tensor_at(y, i * d), w->mode, own_row(w, thread, 1));
-        w->k->norm(d, &p, from, to);
-        dar_row_put(w->type, to, y->dtype, dar_tensor_at(y, i * d), d, w->mode);
+        for (size_t j = 0, n; j < d; j += n) {
+            dar_norm q = piece_of(w, &p, j);
+            void *to = dar_row_out(w->type, y->dtype, dar_tensor_at(y, i * d + j), w->mode, buf);
+            n = piece(w, j);
+            ask(w, &q, 0, x, i, j);
+            w->k->norm(n, &q, from + j * size, to);
+            dar_row_put(w->type, to, y->dtype, dar_tensor_at(y, i * d + j), n, w->mode);
+        }
         save(w, i, &p);
     }
 }
@@ -148,37 +176,36 @@ static void backward_row(const struct walk *w, size_t row, size_t group, void *c
 {
     const dar_opctx *c = w->c;
     const dar_tensor *x = &c->x[X], *gy = &c->gy, *gx = &c->gx[X];
-    size_t d = w->d, i = row * d;
-    const void *from = dar_row_get(w->type, x->dtype, dar_tensor_at(x, i), d, own_row(w, thread, 0));
-    const void *g = dar_row_get(w->type, gy->dtype, dar_tensor_at(gy, i), d, own_row(w, thread, 1));
-    double sum[2] = { 0 };
+    size_t d = w->d, i = row * d, size = dar_dtype_size(w->type);
+    const char *from = dar_row_get(w->type, x->dtype, dar_tensor_at(x, i), d, own_row(w, thread, 0));
+    const char *g = dar_row_get(w->type, gy->dtype, dar_tensor_at(gy, i), d, own_row(w, thread, 1));
+    double sum[2] = { 0 }, buf[DAR_PIECE];
     dar_norm p = saved(w, row);
 
     set_weights(w, group, &p);
     w->k->norm_sums(d, &p, from, g, sum, part[0], part[1]);
     if (!gx->data) return;
     double mean[2] = { w->kind->centred ? sum[0] / (double)d : 0, sum[1] / (double)d };
-    void *to = dar_row_out(w->type, gx->dtype, dar_tensor_at(gx, i), w->mode, own_row(w, thread, 2));
-    w->k->norm_back(d, &p, from, g, mean, to);
-    dar_row_put(w->type, to, gx->dtype, dar_tensor_at(gx, i), d, w->mode);
+    for (size_t j = 0; j < d; j += DAR_PIECE) {
+        size_t n = piece(w, j);
+        dar_norm q = piece_of(w, &p, j);
+        ask(w, &q, 0, x, row, j);
+        ask(w, &q, 1, gy, row, j);
+        void *to = dar_row_out(w->type, gx->dtype, dar_tensor_at(gx, i + j), w->mode, buf);
+        w->k->norm_back(n, &q, from + j * size, g + j * size, mean, to);
+        dar_row_put(w->type, to, gx->dtype, dar_tensor_at(gx, i + j), n, w->mode);
+    }
 }
 
 static void backward_chunk(void *ctx, size_t i, int thread)
 {
     const struct walk *w = ctx;
-    const dar_tensor *x = &w->c->x[X], *gy = &w->c->gy;
     dar_chunk chunk = dar_groups_chunk(&w->groups, i);
     void *part[2] = { 0 };
 
     for (int j = 0; j < 2; j++)
         if (w->part[j]) part[j] = memset(at(w, w->part[j] + i * w->row), 0, w->row);
-    for (size_t row = chunk.begin; row < chunk.end; row++) {
-        if (row + 1 < chunk.end) {
-            dar_row_ahead(dar_tensor_at(x, (row + 1) * w->d), w->d * dar_dtype_size(x->dtype));
-            dar_row_ahead(dar_tensor_at(gy, (row + 1) * w->d), w->d * dar_dtype_size(gy->dtype));
-        }
-        backward_row(w, row, chunk.group, part, thread);
-    }
+    for (size_t row = chunk.begin; row < chunk.end; row++) backward_row(w, row, chunk.group, part, thread);
 }
 
 static void backward(const dar_opctx *c, const struct kind *kind)

@@ -5,7 +5,7 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define CHUNK 32768 /* elements per task */
+#define CHUNK 65536 /* elements per task */
 #define BASE  10000 /* of the frequencies */
 
 enum { X, TABLE };
@@ -87,7 +87,6 @@ static void rotate_rows(void *ctx, size_t begin, size_t end, int thread)
             size_t n = w->d - j < step ? w->d - j : step, i = row * w->d + j;
             const void *x = dar_row_get(w->type, w->from->dtype, dar_tensor_at(w->from, i), n, xbuf);
             void *y = dar_row_out(w->type, w->to->dtype, dar_tensor_at(w->to, i), w->mode, ybuf);
-            dar_row_ahead(dar_tensor_at(w->from, i + n), n * dar_dtype_size(w->from->dtype));
             k->rope(n, w->e, x, table, y, w->backward);
             dar_row_put(w->type, y, w->to->dtype, dar_tensor_at(w->to, i), n, w->mode);
         }
