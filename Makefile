@@ -89,7 +89,7 @@ test: deps ## install what is missing, build, run every test; the last line coun
 test-built: $(TESTS:%=$B/%)
 	@scripts/run-tests.sh $B $(TESTS)
 
-$B/bench_kernels: $(BENCH)
+$B/bench_kernels: $(BENCH) $B/tests/net.o
 $B/ulp: $B/tests/ulp.o
 $B/bench_kernels $B/ulp: $B/libdar.a
 	@echo "LD $@"

@@ -154,7 +154,9 @@ dar_val *net_forward(dar_tape *t, net *n, dar_val *input)
     dar_val *x = input, *context = dar_leaf(t, n->context, NULL);
     for (int i = 0; i < n->s.blocks; i++) {
         struct block_arg *a = dar_tape_store(t, &(struct block_arg){ n, &n->block[i] }, sizeof *a);
-        x = dar_segment(t, block_forward, a, (dar_val *[]){ x, context }, 2, x->x.dtype, x->x.shape);
+        dar_val *in[] = { x, context };
+        if (n->s.whole && t->recording) x = block_forward(t, a, in);
+        else x = dar_segment(t, block_forward, a, in, 2, x->x.dtype, x->x.shape);
     }
     return x;
 }

@@ -18,6 +18,7 @@ typedef struct net_size {
     dar_dtype storage; /* of frozen weights and of what is multiplied; the residual stream is f32, or f64 */
     bool train;        /* gradient memory for the trainable weights */
     bool keep;         /* keep the results of attention for the replay of a block */
+    bool whole;        /* record blocks as they are, not as recompute segments */
 } net_size;
 
 typedef struct net_weight {
@@ -45,7 +46,8 @@ void net_init(net *n, net_size s, dar_arena *a);
 /* Bytes that net_init pushes. */
 size_t net_bytes(net_size s);
 
-/* The blocks, each a recompute segment.  input: [1, N, D] of the main type. */
+/* The blocks, each a recompute segment unless `whole`; with recording off each gives its memory back.  input: [1, N, D]
+ * of the main type. */
 dar_val *net_forward(dar_tape *t, net *n, dar_val *input);
 
 /* Mean squared distance of net_forward from the target. */
