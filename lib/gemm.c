@@ -166,9 +166,20 @@ static void finish_row(const struct finish *f, size_t i, size_t j, size_t n, voi
                 f->add ? DAR_PUT_ADD : DAR_PUT);
 }
 
+/* The next tile down will be stored at rows i to i + m: ask for them, since a store that misses holds up the rest. */
+static void fetch_rows(const struct finish *f, size_t i, size_t j, size_t m, size_t n)
+{
+    size_t size = dar_dtype_size(f->type);
+    uintptr_t c = (uintptr_t)f->c + (i * f->ldc + j) * size;
+    for (size_t r = 0; r < m; r++)
+        for (size_t at = 0; at < n * size; at += DAR_ALIGN)
+            __builtin_prefetch((const void *)(c + r * f->ldc * size + at), 1);
+}
+
 static void finish_tile(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
 {
     const struct finish *f = ctx;
+    if (f->type != f->real) fetch_rows(f, i + m, j, m, n);
     for (size_t r = 0; r < m; r++) finish_row(f, i + r, j, n, (char *)c + r * ldc * dar_dtype_size(f->real));
 }
 
@@ -297,6 +308,7 @@ static void finish_i8(const void *ctx, size_t i, size_t j, size_t m, size_t n, v
     const int32_t *offset = s->offset + j;
     const float *w_scale = s->g->w_scale + j;
     float row[BLAS_COLS];
+    if (s->f.type != DAR_F32) fetch_rows(&s->f, i + m, j, m, n);
     for (size_t r = 0; r < m; r++) {
         const int32_t *sum = (const int32_t *)c + r * ldc;
         float scale = s->scale[i + r];
@@ -322,6 +334,9 @@ static size_t describe_i8(const dar_gemm_i8 *g, struct i8 *s, dar_product *p, ch
     s->a = (dar_matrix){ DAR_I8, s->q, row, false, NULL };
     s->b = (dar_matrix){ DAR_I8, g->w, g->k, true, NULL };
     *p = (dar_product){ .tile = t, .m = g->m, .n = g->n, .done = finish_i8, .ctx = s };
+    p->direct = g->type == DAR_F32; /* the integers are summed where the result will be */
+    p->c = g->c;
+    p->ldc = g->ldc;
     p->term[0] = (dar_term){ row, operand_a(t, &s->a, row), { .pack = pack_w, .many = true, .ctx = &s->b } };
     p->term[0].k = g->k;
     return (end + DAR_ALIGN - 1) / DAR_ALIGN * DAR_ALIGN;
