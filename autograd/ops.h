@@ -111,6 +111,7 @@ typedef struct dar_linear_opt {
     dar_act act; /* applied to the sums while they are in the nearest cache */
     bool cast;   /* y has storage type `out`, not that of x */
     dar_dtype out;
+    bool quantise; /* linear with i8 w: forward rounds the rows of x to 8 bits too, and multiplies 8 bits by 8 bits */
 } dar_linear_opt;
 
 /* y = act(x W^T + b).
@@ -119,7 +120,7 @@ typedef struct dar_linear_opt {
  *
  * bf16 x and w multiply as bf16 with f32 sums (gradients are rounded to bf16 as operands); any other pair in f32, or
  * f64 where x is.  i8 weights are scaled back while they are read; they get no gradient.  An activation saves its
- * argument. */
+ * argument.  `quantise` is an error of max|x| / 254 in each x of a row; backward is that of the layer without it. */
 dar_val *dar_linear(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, const dar_linear_opt *o);
 
 /* y = act(x W^T + scale (x A^T) U^T + b): a layer with a low-rank addition.

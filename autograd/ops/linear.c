@@ -138,6 +138,35 @@ static dar_gemm up(const struct parts *s)
     return g;
 }
 
+/* 8 bits by 8 bits: not where the arbiter computes, nor on top of a low-rank term. */
+static bool quantised(const struct parts *s)
+{
+    return s->at->o.quantise && s->c->x[W].dtype == DAR_I8 && s->type == DAR_F32 && !s->r;
+}
+
+static dar_gemm_i8 up_i8(const struct parts *s)
+{
+    const dar_tensor *x = &s->c->x[X], *w = &s->c->x[W];
+    dar_gemm g = up(s);
+    return (dar_gemm_i8){
+        .m = g.m,
+        .n = g.n,
+        .k = g.k,
+        .a_type = x->dtype,
+        .a = x->data,
+        .lda = s->k,
+        .w = w->data,
+        .w_scale = w->scale,
+        .type = g.type,
+        .c = g.c,
+        .ldc = g.ldc,
+        .bias = g.bias,
+        .bias_type = g.bias_type,
+        .pre = g.pre,
+        .act = g.act,
+    };
+}
+
 /* The products of backward over rows [i, i + m), whose gp lies at `gp`.  m = 0: none is wanted. */
 static dar_gemm back(const struct parts *s, int of, size_t i, size_t m, const char *gp)
 {
@@ -203,6 +232,11 @@ static void forward(const dar_opctx *c)
     struct parts s = parts_of(c, false);
     dar_gemm h = down(&s), y = up(&s);
 
+    if (quantised(&s)) {
+        dar_gemm_i8 q = up_i8(&s);
+        dar_gemm_i8_run(&q, s.rest);
+        return;
+    }
     if (s.r) dar_gemm_run(&h, s.rest);
     dar_gemm_run(&y, s.rest);
 }
@@ -261,8 +295,9 @@ static size_t scratch(const dar_opctx *c, bool backward)
     dar_gemm h = down(&s), y = up(&s);
 
     if (!backward) {
+        dar_gemm_i8 q = up_i8(&s);
         rest = larger(s.r ? dar_gemm_scratch(&h) : 0, dar_gemm_scratch(&y));
-        return s.head + rest;
+        return s.head + (quantised(&s) ? dar_gemm_i8_scratch(&q) : rest);
     }
     for (size_t i = 0; i < s.m; i += piece(&s)) { /* the last piece may be cut otherwise than the first */
         size_t m = s.m - i < piece(&s) ? s.m - i : piece(&s);
