@@ -24,6 +24,11 @@ const char *bench_blas_core(void)
     return openblas_get_corename();
 }
 
+static void count_flops(bench *b)
+{
+    b->flops[0] = 2.0 * (double)b->s[0] * (double)b->s[1] * (double)b->s[2];
+}
+
 /* An operand [rows, columns] as stored; t: used transposed. */
 static dar_matrix matrix(bench *b, dar_dtype type, int64_t rows, int64_t columns, bool t)
 {
@@ -47,7 +52,7 @@ static void setup_product(bench *b, int64_t m, int64_t n, int64_t k, dar_matrix 
     l->scratch = dar_arena_push(b->arena, dar_gemm_scratch(&l->gemm));
     if (b->row->against_rival) l->c = bench_tensor(b, DAR_F32, DAR_SHAPE(m, n)).data;
     b->state = l;
-    b->flops[0] = 2.0 * (double)m * (double)n * (double)k;
+    count_flops(b);
 }
 
 static void setup_nt(bench *b)
@@ -84,11 +89,46 @@ static void run_blas(bench *b)
                 (int)g->n, (int)g->k, 1, g->a.data, (int)g->a.ld, g->b.data, (int)g->b.ld, 0, l->c, (int)g->n);
 }
 
+/* ---------------------------------------------------------------- 8-bit weights and activations, bf16 outside */
+
+struct layer_i8 {
+    dar_gemm_i8 gemm;
+    void *scratch;
+};
+
+static void setup_i8(bench *b)
+{
+    int64_t M = b->s[0], N = b->s[1], K = b->s[2];
+    struct layer_i8 *l = dar_arena_push(b->arena, sizeof *l);
+    dar_tensor w = bench_tensor(b, DAR_I8, DAR_SHAPE(N, K));
+    l->gemm = (dar_gemm_i8){ .m = (size_t)M,
+                             .n = (size_t)N,
+                             .k = (size_t)K,
+                             .a_type = DAR_BF16,
+                             .a = bench_tensor(b, DAR_BF16, DAR_SHAPE(M, K)).data,
+                             .lda = (size_t)K,
+                             .w = w.data,
+                             .w_scale = w.scale,
+                             .type = DAR_BF16,
+                             .c = bench_tensor(b, DAR_BF16, DAR_SHAPE(M, N)).data,
+                             .ldc = (size_t)N };
+    l->scratch = dar_arena_push(b->arena, dar_gemm_i8_scratch(&l->gemm));
+    b->state = l;
+    count_flops(b);
+}
+
+static void run_i8(bench *b)
+{
+    const struct layer_i8 *l = b->state;
+    dar_gemm_i8_run(&l->gemm, l->scratch);
+}
+
 /* ---------------------------------------------------------------- rows */
 
 static const bench_kind nt = { .part = { "gemm_nt" }, .setup = setup_nt, .run = { run_product }, .rival = run_blas };
 static const bench_kind nn = { .part = { "gemm_nn" }, .setup = setup_nn, .run = { run_product }, .rival = run_blas };
 static const bench_kind tn = { .part = { "gemm_tn" }, .setup = setup_tn, .run = { run_product }, .rival = run_blas };
+static const bench_kind i8 = { .part = { "gemm_nt" }, .setup = setup_i8, .run = { run_i8 } };
 
 #define LAYER(kind, type, peak, bar, M, N, K)                                                                          \
     {                                                                                                                  \
@@ -119,6 +159,8 @@ const bench_row bench_product_rows[] = {
     LAYERS(nn, DAR_BF16, BENCH_BF16, 0.83, 8192),
     LAYERS(tn, DAR_BF16, BENCH_BF16, 0.83, 2048),
     LAYERS(tn, DAR_BF16, BENCH_BF16, 0.83, 8192),
+    LAYERS(i8, DAR_I8, BENCH_I8, 0.84, 2048),
+    LAYERS(i8, DAR_I8, BENCH_I8, 0.84, 8192),
     THINS(nt),
     THINS(nn),
     THINS(tn),
