@@ -95,9 +95,10 @@ static dar_matrix matrix_of(const dar_tensor *x, bool transposed)
 
 /* ---------------------------------------------------------------- products */
 
-/* h = s x A^T for rows [i, i + m). */
+/* h = s x A^T; m = 0 without LoRA. */
 static dar_gemm down(const struct parts *s)
 {
+    if (!s->r) return (dar_gemm){ .kind = s->kind, .type = s->type };
     return (dar_gemm){
         .kind = s->kind,
         .m = s->m,
@@ -202,10 +203,10 @@ static dar_gemm back(const struct parts *s, int of, size_t i, size_t m, const ch
 /* gh = s gp U */
 static dar_gemm back_h(const struct parts *s, size_t m, const char *gp)
 {
-    bool wanted = s->r && (s->c->gx[X].data || s->c->gx[A].data);
+    if (!s->r || !(s->c->gx[X].data || s->c->gx[A].data)) return (dar_gemm){ .kind = s->kind, .type = s->type };
     return (dar_gemm){
         .kind = s->kind,
-        .m = wanted ? m : 0,
+        .m = m,
         .n = s->r,
         .k = s->n,
         .a = matrix(s->type, gp, s->n, false),
@@ -237,7 +238,7 @@ static void forward(const dar_opctx *c)
         dar_gemm_i8_run(&q, s.rest);
         return;
     }
-    if (s.r) dar_gemm_run(&h, s.rest);
+    dar_gemm_run(&h, s.rest);
     dar_gemm_run(&y, s.rest);
 }
 
@@ -296,7 +297,7 @@ static size_t scratch(const dar_opctx *c, bool backward)
 
     if (!backward) {
         dar_gemm_i8 q = up_i8(&s);
-        rest = larger(s.r ? dar_gemm_scratch(&h) : 0, dar_gemm_scratch(&y));
+        rest = larger(dar_gemm_scratch(&h), dar_gemm_scratch(&y));
         return s.head + (quantised(&s) ? dar_gemm_i8_scratch(&q) : rest);
     }
     for (size_t i = 0; i < s.m; i += piece(&s)) { /* the last piece may be cut otherwise than the first */
