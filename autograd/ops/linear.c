@@ -424,7 +424,10 @@ static double terms(const dar_shape *in, int n_in, const void *attr, int of)
     }
 #define ABSENT                                                                                                         \
     {                                                                                                                  \
-        -1                                                                                                             \
+        -1,                                                                                                            \
+        {                                                                                                              \
+            0                                                                                                          \
+        }                                                                                                              \
     }
 
 static const dar_sample linear_samples[] = {
