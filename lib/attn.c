@@ -271,13 +271,14 @@ static void forward_block(const struct job *j, const struct forward_scratch *f, 
     product(j->outer, m, j->E, n, p, f->v, o, j->E, !first);
 }
 
-/* Divide by the sums, store y and the statistics. */
-static void forward_finish(const struct job *j, const struct forward_scratch *f, size_t head, size_t q0, size_t rows)
+/* Divide m rows from i0 of the range by their sums, store y and the statistics. */
+static void forward_finish(const struct job *j, const struct forward_scratch *f, size_t head, size_t q0, size_t i0,
+                           size_t m)
 {
     const dar_attn *a = j->a;
     size_t b = head / j->A, h = head % j->A;
 
-    for (size_t i = 0; i < rows; i++) {
+    for (size_t i = i0; i < i0 + m; i++) {
         double sum = j->rows->sum(DAR_ATTN_LANES, f->sum + i * DAR_ATTN_LANES * j->real_size);
         char *y = row_at(&a->y, b * j->Nq + q0 + i, h * j->E);
         void *to = dar_row_out(j->real, a->y.dtype, y, DAR_PUT, f->row);
@@ -315,10 +316,12 @@ static void forward_task(void *ctx, size_t task, int thread)
             size_t part = k_row + k0 + n + i * KEYS / rows;
             ahead(j, &a->k, part, KEYS * ROWS / rows + 1, k_row + j->Nk, col);
             ahead(j, &a->v, part, KEYS * ROWS / rows + 1, k_row + j->Nk, col);
+            bool last = k0 + n == j->Nk;
+            if (last) ahead(j, &a->y, q_row + i, m, q_row + rows, col);
             forward_block(j, &f, i, m, n, lw, !k0);
+            if (last) forward_finish(j, &f, head, q0, i, m);
         }
     }
-    forward_finish(j, &f, head, q0, rows);
 }
 
 void dar_attn_forward(const dar_attn *a)
