@@ -23,7 +23,7 @@
 #include "lib/tile.h"
 
 #define LOG2_E 1.4426950408889634
-#define TASKS  16  /* wanted of few heads, so that many processors have work */
+#define TASKS  12  /* wanted of few heads, so that many processors have work */
 #define DEPTH  256 /* units of k that a product takes at a time: a stripe stays in the first-level cache */
 #define EDGE   16  /* columns beside a block, so that its rows lie in different sets of the caches */
 
@@ -396,7 +396,7 @@ static struct job backward_job(const dar_attn *a)
     bool keys = a->gk.data || a->gv.data;
 
     j.range = keys ? round_up(j.Nq, QUERIES) : range_of(j.Nq, parts, QUERIES, 4 * QUERIES, 32 * QUERIES);
-    j.split = keys ? range_of(j.Nk, parts, ROWS_BACK, 4 * ROWS_BACK, SIZE_MAX) : round_up(j.Nk, ROWS_BACK);
+    j.split = keys ? range_of(j.Nk, parts, ROWS_BACK, 3 * ROWS_BACK, SIZE_MAX) : round_up(j.Nk, ROWS_BACK);
     j.ranges = j.range ? ceil_div(j.Nq, j.range) : 0;
     if (keys) j.ranges = 1; /* no query: their gradients are 0 */
     j.splits = j.split ? ceil_div(j.Nk, j.split) : 0;
