@@ -117,6 +117,40 @@ float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q)
     return scale;
 }
 
+struct adamw {
+    const dar_adamw *a;
+    dar_dtype c, moments;
+    char *w, *m, *v;
+    const char *g;
+};
+
+static void adamw_range(void *ctx, size_t begin, size_t end, int thread)
+{
+    const struct adamw *p = ctx;
+    const dar_kern *k = dar_kern_for(p->c);
+    size_t size = dar_dtype_size(p->c), stored = dar_dtype_size(p->moments);
+    double mbuf[DAR_PIECE], vbuf[DAR_PIECE];
+    (void)thread;
+    for (size_t i = begin; i < end; i += DAR_PIECE) {
+        size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
+        void *m_at = p->m + i * stored, *v_at = p->v + i * stored;
+        void *m = dar_row_out(p->c, p->moments, m_at, DAR_PUT, mbuf);
+        void *v = dar_row_out(p->c, p->moments, v_at, DAR_PUT, vbuf);
+        dar_row_get(p->c, p->moments, m_at, n, m);
+        dar_row_get(p->c, p->moments, v_at, n, v);
+        k->adamw(n, p->a, p->w + i * size, m, v, p->g + i * size);
+        dar_row_put(p->c, m, p->moments, m_at, n, DAR_PUT);
+        dar_row_put(p->c, v, p->moments, v_at, n, DAR_PUT);
+    }
+}
+
+void dar_row_adamw(const dar_adamw *a, dar_dtype c, dar_dtype moments, size_t n, void *w, void *m, void *v,
+                   const void *g)
+{
+    struct adamw p = { a, c, moments, w, m, v, g };
+    dar_parallel_range(n, 16 * DAR_PIECE, adamw_range, &p);
+}
+
 struct scan {
     dar_dtype type;
     const char *x;

@@ -137,6 +137,11 @@ static inline void dar_row_ahead(const void *p, size_t bytes)
  * gives zeros with scale NaN, so that it stays visible.  Returns the scale. */
 float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q);
 
+/* A step of AdamW over n parameters w with gradients g of arithmetic type c; the moments m, v are stored as `moments`.
+ * Runs on all threads. */
+void dar_row_adamw(const dar_adamw *a, dar_dtype c, dar_dtype moments, size_t n, void *w, void *m, void *v,
+                   const void *g);
+
 /* Index of the first NaN or Inf of n elements, or -1.  Runs on all threads. */
 int64_t dar_row_nonfinite(dar_dtype t, const void *x, size_t n);
 

@@ -373,6 +373,41 @@ static void quantised_rows(void **state)
     CHECK(isnan(dar_row_quantise(DAR_F32, x, DAR_COUNT(x), q)), "scale of an infinity");
 }
 
+/* The whole step against the definition, written out in f64; moments in every storage type, several tasks. */
+static void adamw_steps(void **state)
+{
+    (void)state;
+    static const dar_dtype types[] = { DAR_F32, DAR_BF16 };
+    static float w[20000], g[20000], m32[20000], v32[20000];
+    static uint16_t m16[20000], v16[20000];
+    for (size_t t = 0; t < DAR_COUNT(types); t++) {
+        void *m = t ? (void *)m16 : m32, *v = t ? (void *)v16 : v32;
+        for (uint32_t i = 0; i < DAR_COUNT(w); i++) {
+            w[i] = (float)((int32_t)noise(i) * 0x1p-31);
+            g[i] = (float)((int32_t)noise(i + 7) * 0x1p-31);
+            dar_dtype_set(types[t], m, i, (int32_t)noise(i + 99) * 0x1p-31);
+            dar_dtype_set(types[t], v, i, fabs((int32_t)noise(i + 999) * 0x1p-31));
+        }
+        double wi[3], mi[3], vi[3];
+        static const size_t at[] = { 0, 16384, 19999 };
+        for (int i = 0; i < 3; i++) {
+            double d = g[at[i]] * adamw.scale;
+            mi[i] = adamw.beta1 * dar_dtype_get(types[t], m, at[i]) + (1 - adamw.beta1) * d;
+            vi[i] = adamw.beta2 * dar_dtype_get(types[t], v, at[i]) + (1 - adamw.beta2) * d * d;
+            double step = mi[i] * adamw.fix1 / (sqrt(vi[i] * adamw.fix2) + adamw.eps) + adamw.decay * w[at[i]];
+            wi[i] = w[at[i]] - adamw.rate * step;
+        }
+        dar_row_adamw(&adamw, DAR_F32, types[t], DAR_COUNT(w), w, m, v, g);
+        double unit =
+            t ? 0x1p-8 : 0x1p-22; /* a moment is rounded once to its type; three roundings before, of 1 at most */
+        for (int i = 0; i < 3; i++) {
+            CHECK_NEAR("adamw w", w[at[i]], wi[i], 40 * 0x1p-24); /* as for the kernel */
+            CHECK_NEAR("adamw m", dar_dtype_get(types[t], m, at[i]), mi[i], unit);
+            CHECK_NEAR("adamw v", dar_dtype_get(types[t], v, at[i]), vi[i], unit);
+        }
+    }
+}
+
 static int setup(void **state)
 {
     (void)state;
@@ -383,9 +418,9 @@ static int setup(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(exact_kernels),  cmocka_unit_test(functions), cmocka_unit_test(ulps),
-        cmocka_unit_test(conversions),    cmocka_unit_test(streams),   cmocka_unit_test(reductions_see_everything),
-        cmocka_unit_test(quantised_rows),
+        cmocka_unit_test(exact_kernels),  cmocka_unit_test(functions),   cmocka_unit_test(ulps),
+        cmocka_unit_test(conversions),    cmocka_unit_test(streams),     cmocka_unit_test(reductions_see_everything),
+        cmocka_unit_test(quantised_rows), cmocka_unit_test(adamw_steps),
     };
     return cmocka_run_group_tests(tests, setup, NULL) != 0;
 }

@@ -1,7 +1,9 @@
 /* channel_norm.c: the norm of the VAE, over channels that are strided in memory.
  *
- * Work goes by blocks of places: all channels of a block fit the second-level cache, so the second pass over them reads
- * no memory.  Within a block every channel is a row, and what belongs to a place (norm, products) is a row too. */
+ * Work goes by blocks of places.  The first pass brings all channels of a block together in scratch of the thread,
+ * which the second-level cache holds (where they lie, their distance is often a power of two, and they would push each
+ * other out); the second pass reads no memory.  Within a block every channel is a row, and what belongs to a place
+ * (norm, products) is a row too. */
 #include <math.h>
 #include <string.h>
 
@@ -12,6 +14,7 @@
 
 #define BLOCK 65536 /* elements of a block, at most, unless there are more than 1024 channels */
 #define RUN   32    /* channels added in a row; then the sums of the runs: short sums lose less */
+#define AHEAD 4     /* channels asked for before they are needed: no prefetcher follows from one to the next */
 #define LEAST 1e-24 /* of a squared norm */
 
 enum { X, W };
@@ -22,13 +25,21 @@ struct walk {
     const dar_kern *k;
     size_t channels, places, block, blocks; /* of one clip */
     dar_put mode;
-    char *part; /* [clips blocks, C]; NULL: the gradient of w is not wanted */
+    size_t staged;  /* bytes of one tensor's block in scratch; each thread has two */
+    size_t scratch; /* in all; partial sums for the gradient of w, [clips blocks, C], are at the end */
+    size_t part;    /* where; 0: that gradient is not wanted */
 };
 
 /* Places [first, first + n) of clip `clip`. */
 struct block {
     size_t clip, first, n;
+    char *staged[2]; /* [C, n] of x, of gy */
 };
+
+static size_t tasks(const struct walk *w)
+{
+    return (size_t)w->c->x[X].shape.d[0] * w->blocks;
+}
 
 static struct walk walk_of(const dar_opctx *c)
 {
@@ -41,19 +52,20 @@ static struct walk walk_of(const dar_opctx *c)
     if (w.block < 64) w.block = 64;
     if (w.block > DAR_PIECE) w.block = DAR_PIECE;
     w.blocks = (w.places + w.block - 1) / w.block;
-    w.part = c->gx[W].data ? c->scratch : NULL;
+    w.staged = dar_mul_size(w.channels, w.block * dar_dtype_size(w.type));
+    w.scratch = dar_mul_size(2 * (size_t)c->threads, w.staged);
+    if (c->gx[W].data) {
+        w.part = w.scratch;
+        w.scratch = dar_add_size(w.scratch, dar_mul_size(tasks(&w), w.channels * dar_dtype_size(w.type)));
+    }
     return w;
 }
 
-static size_t tasks(const struct walk *w)
-{
-    return (size_t)w->c->x[X].shape.d[0] * w->blocks;
-}
-
-static struct block block_of(const struct walk *w, size_t i)
+static struct block block_of(const struct walk *w, size_t i, int thread)
 {
     size_t first = i % w->blocks * w->block, left = w->places - first;
-    return (struct block){ i / w->blocks, first, left < w->block ? left : w->block };
+    char *own = (char *)w->c->scratch + 2 * (size_t)thread * w->staged;
+    return (struct block){ i / w->blocks, first, left < w->block ? left : w->block, { own, own + w->staged } };
 }
 
 static void *place(const struct walk *w, const struct block *b, const dar_tensor *x, size_t channel)
@@ -61,9 +73,18 @@ static void *place(const struct walk *w, const struct block *b, const dar_tensor
     return dar_tensor_at(x, (b->clip * w->channels + channel) * w->places + b->first);
 }
 
-static const void *get(const struct walk *w, const struct block *b, const dar_tensor *x, size_t channel, void *buf)
+static char *staged(const struct walk *w, const struct block *b, int which, size_t channel)
 {
-    return dar_row_get(w->type, x->dtype, place(w, b, x, channel), b->n, buf);
+    return b->staged[which] + channel * b->n * dar_dtype_size(w->type);
+}
+
+/* Bring a channel of the block into scratch. */
+static const void *stage(const struct walk *w, const struct block *b, int which, const dar_tensor *x, size_t channel)
+{
+    void *row = staged(w, b, which, channel);
+    if (channel + AHEAD < w->channels) dar_row_ahead(place(w, b, x, channel + AHEAD), b->n * dar_dtype_size(x->dtype));
+    dar_row_convert(w->type, row, x->dtype, place(w, b, x, channel), b->n);
+    return row;
 }
 
 static double weight(const struct walk *w, size_t channel)
@@ -87,13 +108,13 @@ static void squares(const struct walk *w, const struct block *b, void *excess)
 {
     const dar_tensor *x = &w->c->x[X];
     size_t bytes = b->n * dar_dtype_size(w->type);
-    double buf[DAR_PIECE], run[DAR_PIECE];
+    double run[DAR_PIECE];
 
     memset(excess, 0, bytes);
     for (size_t c = 0; c < w->channels;) {
         memset(run, 0, bytes);
         for (size_t end = c + RUN < w->channels ? c + RUN : w->channels; c < end; c++) {
-            const void *row = get(w, b, x, c, buf);
+            const void *row = stage(w, b, 0, x, c);
             w->k->mul_add(b->n, row, row, run, run);
         }
         w->k->add(b->n, excess, run, excess);
@@ -104,10 +125,9 @@ static void squares(const struct walk *w, const struct block *b, void *excess)
 static void forward_block(void *ctx, size_t i, int thread)
 {
     const struct walk *w = ctx;
-    const dar_tensor *x = &w->c->x[X], *y = &w->c->y, *aux = &w->c->aux;
-    struct block b = block_of(w, i);
+    const dar_tensor *y = &w->c->y, *aux = &w->c->aux;
+    struct block b = block_of(w, i, thread);
     double excess[DAR_PIECE], r[DAR_PIECE], buf[DAR_PIECE];
-    (void)thread;
 
     squares(w, &b, excess);
     scale_of(w, b.n, excess, r);
@@ -115,7 +135,7 @@ static void forward_block(void *ctx, size_t i, int thread)
         dar_row_put(w->type, excess, aux->dtype, dar_tensor_at(aux, b.clip * w->places + b.first), b.n, DAR_PUT);
     for (size_t c = 0; c < w->channels; c++) {
         void *to = dar_row_out(w->type, y->dtype, place(w, &b, y, c), w->mode, buf);
-        w->k->mul(b.n, dar_row_get(w->type, x->dtype, place(w, &b, x, c), b.n, buf), r, to);
+        w->k->mul(b.n, staged(w, &b, 0, c), r, to);
         w->k->scale(b.n, weight(w, c), to, to);
         dar_row_put(w->type, to, y->dtype, place(w, &b, y, c), b.n, w->mode);
     }
@@ -135,13 +155,13 @@ static void products(const struct walk *w, const struct block *b, const void *r,
 {
     const dar_tensor *x = &w->c->x[X], *gy = &w->c->gy;
     size_t size = dar_dtype_size(w->type), bytes = b->n * size;
-    double buf[DAR_PIECE], gbuf[DAR_PIECE], run[DAR_PIECE];
+    double buf[DAR_PIECE], run[DAR_PIECE];
 
     memset(dot, 0, bytes);
     for (size_t c = 0; c < w->channels;) {
         memset(run, 0, bytes);
         for (size_t end = c + RUN < w->channels ? c + RUN : w->channels; c < end; c++) {
-            w->k->mul(b->n, get(w, b, x, c, buf), get(w, b, gy, c, gbuf), buf);
+            w->k->mul(b->n, stage(w, b, 0, x, c), stage(w, b, 1, gy, c), buf);
             if (part) dar_dtype_set(w->type, part, c, w->k->dot(b->n, buf, r));
             w->k->axpy(b->n, weight(w, c), buf, run);
         }
@@ -149,27 +169,31 @@ static void products(const struct walk *w, const struct block *b, const void *r,
     }
 }
 
+static char *part_of(const struct walk *w, size_t i)
+{
+    return w->part ? (char *)w->c->scratch + w->part + i * w->channels * dar_dtype_size(w->type) : NULL;
+}
+
 /* gx = w gy r - x r^3 / C dot; where the norm is at its least, it is constant and the second part 0. */
 static void backward_block(void *ctx, size_t i, int thread)
 {
     const struct walk *w = ctx;
-    const dar_tensor *x = &w->c->x[X], *gy = &w->c->gy, *gx = &w->c->gx[X], *aux = &w->c->aux;
-    struct block b = block_of(w, i);
-    double r[DAR_PIECE], q[DAR_PIECE], buf[DAR_PIECE], gbuf[DAR_PIECE];
+    const dar_tensor *gx = &w->c->gx[X], *aux = &w->c->aux;
+    struct block b = block_of(w, i, thread);
+    double r[DAR_PIECE], q[DAR_PIECE], buf[DAR_PIECE];
     const void *excess = dar_tensor_at(aux, b.clip * w->places + b.first);
-    (void)thread;
 
     scale_of(w, b.n, excess, r);
-    products(w, &b, r, q, w->part ? w->part + i * w->channels * dar_dtype_size(w->type) : NULL);
+    products(w, &b, r, q, part_of(w, i));
     if (!gx->data) return;
     w->k->relu_back(b.n, excess, q, q);
     for (int power = 0; power < 3; power++) w->k->mul(b.n, q, r, q);
     w->k->scale(b.n, -1 / (double)w->channels, q, q);
     for (size_t c = 0; c < w->channels; c++) {
-        void *to = dar_row_out(w->type, gx->dtype, place(w, &b, gx, c), w->mode, gbuf);
-        w->k->mul(b.n, dar_row_get(w->type, gy->dtype, place(w, &b, gy, c), b.n, gbuf), r, gbuf);
-        w->k->scale(b.n, weight(w, c), gbuf, gbuf);
-        w->k->mul_add(b.n, dar_row_get(w->type, x->dtype, place(w, &b, x, c), b.n, buf), q, gbuf, to);
+        void *to = dar_row_out(w->type, gx->dtype, place(w, &b, gx, c), w->mode, buf), *g = staged(w, &b, 1, c);
+        w->k->mul(b.n, g, r, g);
+        w->k->scale(b.n, weight(w, c), g, g);
+        w->k->mul_add(b.n, staged(w, &b, 0, c), q, g, to);
         dar_row_put(w->type, to, gx->dtype, place(w, &b, gx, c), b.n, w->mode);
     }
 }
@@ -180,15 +204,15 @@ static void channel_norm_backward(const dar_opctx *c)
     dar_groups all = { .clips = 1, .tokens = tasks(&w), .rows = 1, .chunk = 1 };
     if (c->gx[X].data) w.mode = dar_put_for(dar_tensor_bytes(&c->gx[X]), c->add[X]);
     dar_parallel(tasks(&w), backward_block, &w);
-    if (w.part) dar_groups_combine(&all, w.type, w.part, w.channels, &c->gx[W], c->add[W]);
+    if (w.part) dar_groups_combine(&all, w.type, part_of(&w, 0), w.channels, &c->gx[W], c->add[W]);
 }
 
 /* ---------------------------------------------------------------- the op */
 
 static size_t channel_norm_scratch(const dar_opctx *c, bool backward)
 {
-    struct walk w = walk_of(c);
-    return backward && c->gx[W].data ? dar_mul_size(tasks(&w), w.channels * dar_dtype_size(w.type)) : 0;
+    (void)backward;
+    return walk_of(c).scratch;
 }
 
 static dar_shape channel_norm_shape(const dar_shape *in, int n_in, const void *attr)
