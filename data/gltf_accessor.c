@@ -62,6 +62,7 @@ static dar_status unpack(dar_gltf *g, dar_json packed, dar_gltf_bytes *view)
     if (expected) return DAR_GLTF_REJECT(g, packed, NULL, "%s", expected);
     view->data = out;
     view->size = form.count * form.stride;
+    if (form.mode == DAR_MESHOPT_ATTRIBUTES) view->stride = form.stride;
     return DAR_OK;
 }
 
