@@ -335,7 +335,7 @@ static void write_file(const char *path, const void *data, size_t size)
 static void external(void **state)
 {
     (void)state;
-    char dir[] = "/tmp/dar-mesh-XXXXXX", path[64], bin[64];
+    char dir[] = "/tmp/mesh-XXXXXX", path[64], bin[64];
     dar_scene s;
     dar_err e;
     assert_non_null(mkdtemp(dir));
