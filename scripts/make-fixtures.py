@@ -117,6 +117,144 @@ def corpus():
         "name": file('{"a\\nb":' + f32 + "}", 8),
     })
 
+    put("gltf", gltf_files())
+    put("obj", obj_files())
+    put("image", image_files())
+
+
+def gltf_files():
+    """JSON, a zero byte, the binary chunk."""
+    import json
+    import struct
+
+    def file(arrays, **rest):
+        """arrays: (type, component, numbers, more); one view and accessor each."""
+        code = {5120: "b", 5121: "B", 5122: "h", 5123: "H", 5125: "I", 5126: "f"}
+        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+        data, views, accessors = b"", [], []
+        for kind, component, x, *more in arrays:
+            raw = struct.pack(f"<{len(x)}{code[component]}", *x)
+            views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(raw)})
+            accessors.append({"bufferView": len(views) - 1, "type": kind, "componentType": component,
+                              "count": len(x) // width[kind], **(more[0] if more else {})})
+            data += raw + bytes(-len(raw) % 4)
+        top = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": len(data)}] if data else [], "bufferViews": views,
+               "accessors": accessors, **rest}
+        return json.dumps({k: v for k, v in top.items() if v}, separators=(",", ":")).encode() + b"\0" + data
+
+    x = ("VEC3", 5126, [0, 0, 0, 1, 0, 0, 0, 1, 0])
+    n = ("VEC3", 5126, [0, 0, 1] * 3)
+    times = ("SCALAR", 5126, [0, 1])
+    nodes = [{"mesh": 0}]
+
+    def mesh(**more):
+        return [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1}, **more}]}]
+
+    def animation(path, how, node=0):
+        return [{"channels": [{"sampler": 0, "target": {"node": node, "path": path}}],
+                 "samplers": [{"input": 2, "output": 3, "interpolation": how}]}]
+
+    joints, weights = ("VEC4", 5121, [1, 0, 0, 0] * 3), ("VEC4", 5121, [255, 0, 0, 0] * 3, {"normalized": True})
+    skinned = [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "JOINTS_0": 4, "WEIGHTS_0": 5}}]}]
+    turn = ("VEC4", 5122, [0, 0, 0, 32767, 0, 0, 32767, 0], {"normalized": True})
+    sparse = {"count": 1, "indices": {"bufferView": 2, "componentType": 5121}, "values": {"bufferView": 3}}
+    draco = ["KHR_draco_mesh_compression"]
+    files = {
+        "plain": file([x, n], meshes=mesh(), nodes=nodes),
+        "flat": file([x], meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}], nodes=nodes),
+        "indexed": file([x, n, ("SCALAR", 5121, [2, 1, 0])], meshes=mesh(indices=2), nodes=nodes),
+        "strip": file([x, n], meshes=mesh(mode=5), nodes=nodes),
+        "tree": file([x, n], meshes=mesh(), scenes=[{"nodes": [0]}], scene=0, nodes=[
+            {"children": [1], "scale": [1, -2, 1]}, {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]}]),
+        "cycle": file([], nodes=[{"children": [1]}, {"children": [0]}]),
+        "zero_scale": file([x, n], meshes=mesh(), nodes=[{"mesh": 0, "scale": [0, 0, 0]}]),
+        "step": file([x, n, times, ("VEC3", 5126, [0, 0, 0, 1, 2, 3])], meshes=mesh(), nodes=nodes,
+                     animations=animation("translation", "STEP")),
+        "cubic": file([x, n, times, ("VEC3", 5126, [1] * 18)], meshes=mesh(), nodes=nodes,
+                      animations=animation("scale", "CUBICSPLINE")),
+        "morph": file([x, n, times, ("SCALAR", 5126, [0, 1])], meshes=mesh(targets=[{"POSITION": 1, "NORMAL": 0}]),
+                      nodes=nodes, animations=animation("weights", "LINEAR")),
+        "skin": file([x, n, times, turn, joints, weights], meshes=skinned, skins=[{"joints": [1, 2]}],
+                     nodes=[{"mesh": 0, "skin": 0}, {"children": [2]}, {}], animations=animation("rotation", "LINEAR", 2)),
+        "sparse": file([x, n, ("SCALAR", 5121, [1]), ("VEC3", 5126, [7, 8, 9])], meshes=mesh(), nodes=nodes).replace(
+            b'"count":3}', b'"count":3,"sparse":' + json.dumps(sparse).encode() + b"}", 1),
+        "cameras": file([], nodes=[{"camera": 0}, {"camera": 1}], cameras=[
+            {"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}},
+            {"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 1, "znear": 0, "zfar": 1}}]),
+        "copies": file([x, n], meshes=mesh(), nodes=[{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {
+            "attributes": {"TRANSLATION": 0}}}}]),
+        "required": file([], extensionsRequired=draco),
+        "far": file([("VEC3", 5126, [1e13] * 9), n], meshes=mesh(), nodes=nodes),
+        "nan": file([("VEC3", 5126, [float("nan")] * 9), n], meshes=mesh(), nodes=nodes),
+        "data_uri": b'{"asset":{"version":"2.0"},"buffers":[{"byteLength":4,"uri":"data:;base64,AAAAAA=="}]}',
+        "beside": b'{"asset":{"version":"2.0"},"buffers":[{"byteLength":4,"uri":"../%2e/x"}]}',
+    }
+    body, data = files["plain"].split(b"\0", 1)
+    body += b" " * (-len(body) % 4)
+    chunks = struct.pack("<II", len(body), 0x4E4F534A) + body + struct.pack("<II", len(data), 0x004E4942) + data
+    files["glb"] = b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+    files["glb_cut"] = files["glb"][:-9]
+    files["glb_length"] = b"glTF" + struct.pack("<II", 2, 2**32 - 1) + chunks
+    return files
+
+
+def obj_files():
+    square = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+    return {
+        "empty": b"",
+        "square": square + b"f 1 2 3 4\n",
+        "normals": square + b"vn 0 0 1\nf 1//1 2//1 3//1 4//1\n",
+        "texture": square + b"vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1/1 3/1 4/1\n",
+        "backwards": square + b"f -1 -2 -3\n",
+        "dart": b"v 0 0 0\nv 2 0 0\nv .5 .5 0\nv 0 2 0\nf 1 2 3 4\n",
+        "crossing": b"v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 1 0\nv 3 3 3\nf 1 2 3 4 5\n",
+        "lines": square + b"# c\no a\ng b\nl 1 2\np 1\nusemtl x\nf 1 2 3\r\n",
+        "range": square + b"f 1 2 5\n",
+        "zero": square + b"f 0 1 2\n",
+        "numbers": b"v 1e300 nan 0x10\nv -.5e-3 +7. 123456789012345678901234567890\n",
+        "pattern": b"f_%04d*?.obj\0f_0012xy.obj",
+    }
+
+
+def image_files():
+    """PNG files, a JPEG of 16 x 8 pixels that libjpeg-turbo wrote, and heads of others."""
+    import struct
+    import zlib
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    def png(w, h, depth, color, raw, more=b"", interlace=0):
+        head = chunk(b"IHDR", struct.pack(">IIBBBBB", w, h, depth, color, 0, 0, interlace))
+        return b"\x89PNG\r\n\x1a\n" + head + more + chunk(b"IDAT", zlib.compress(raw, 9)) + chunk(b"IEND", b"")
+
+    jpeg = bytes.fromhex(
+        "ffd8ffe000104a46494600010100000100010000ffdb0043000101010101010101010101010101010101010101010101"
+        "0101010101010101010101010101010101010101010101010101010101010101010101010101010101ffdb0043010101"
+        "010101010101010101010101010101010101010101010101010101010101010101010101010101010101010101010101"
+        "0101010101010101010101010101ffc00011080008001003011100021101031101ffc400140001000000000000000000"
+        "00000000000009ffc40014100100000000000000000000000000000000ffc40016010101010000000000000000000000"
+        "00000b090affc40014110100000000000000000000000000000000ffda000c03010002110311003f0017d29dbf810e55"
+        "01afbfffd9"
+    )
+    rgba = png(2, 1, 8, 6, bytes([0, 255, 0, 0, 255, 0, 10, 20, 128]))
+    return {
+        "empty": b"",
+        "rgba": rgba,
+        "rgb": png(1, 2, 8, 2, bytes([0, 1, 2, 3, 1, 4, 5, 6])),
+        "palette": png(3, 1, 2, 3, bytes([0, 24]), chunk(b"PLTE", bytes(range(9))) + chunk(b"tRNS", bytes([255, 9]))),
+        "grey16": png(1, 2, 16, 0, bytes([0, 18, 52, 2, 171, 205])),
+        "interlaced": png(2, 2, 8, 0, bytes([0, 1, 0, 2, 0, 3, 4]), interlace=1),
+        "cut": rgba[:-20],
+        "huge": png(2**31 - 1, 2**31 - 1, 8, 6, b""),
+        "no_palette": png(1, 1, 8, 3, bytes(2)),
+        "short_rows": png(2, 2, 8, 6, bytes(9)),
+        "jpeg": jpeg,
+        "jpeg_cut": jpeg[:-30],
+        "jpeg_head": b"\xff\xd8\xff\xe0\0\x10JFIF\0\1\1\0\0\1\0\1\0\0\xff\xc0\0\x0b\x08\0\1\0\1\1\1\x11\0\xff\xd9",
+        "jpeg_end": b"\xff\xd8\xff\xd9",
+    }
+
 
 if __name__ == "__main__":
     known = {f.__name__: f for f in (safetensors, torch_rng, corpus)}

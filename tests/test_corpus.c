@@ -6,7 +6,10 @@
 #include "lib/file.h"
 
 /* LLVMFuzzerTestOneInput of tests/fuzz_json.c and so on, renamed by the Makefile. */
+int fuzz_gltf(const uint8_t *data, size_t size);
+int fuzz_image(const uint8_t *data, size_t size);
 int fuzz_json(const uint8_t *data, size_t size);
+int fuzz_obj(const uint8_t *data, size_t size);
 int fuzz_safetensors(const uint8_t *data, size_t size);
 
 static void replay(const char *dir, int (*target)(const uint8_t *, size_t))
@@ -32,10 +35,28 @@ static void replay(const char *dir, int (*target)(const uint8_t *, size_t))
     CHECK(files >= 10, "%s: %d files", dir, files);
 }
 
+static void gltf(void **state)
+{
+    (void)state;
+    replay("tests/corpus/gltf", fuzz_gltf);
+}
+
+static void image(void **state)
+{
+    (void)state;
+    replay("tests/corpus/image", fuzz_image);
+}
+
 static void json(void **state)
 {
     (void)state;
     replay("tests/corpus/json", fuzz_json);
+}
+
+static void obj(void **state)
+{
+    (void)state;
+    replay("tests/corpus/obj", fuzz_obj);
 }
 
 static void safetensors(void **state)
@@ -46,6 +67,7 @@ static void safetensors(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = { cmocka_unit_test(json), cmocka_unit_test(safetensors) };
+    const struct CMUnitTest tests[] = { cmocka_unit_test(gltf), cmocka_unit_test(image), cmocka_unit_test(json),
+                                        cmocka_unit_test(obj), cmocka_unit_test(safetensors) };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
