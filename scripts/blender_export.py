@@ -8,6 +8,8 @@
                       Without it a .bvh becomes sticks, one for each bone
     --frames A:B      default: the scene's, or those that the file's animation covers
     --fps N           default: the scene's, of a .bvh 1 / its frame time
+    --merge           all that moves becomes one animation, as the scene plays.  Done by itself when several things move;
+                      otherwise every action of the one that does is an animation with its name
     --bake            meshes frame by frame, as morph targets: whatever deforms them (simulations, lattices, drivers).
                       Done by itself for meshes that Alembic or USD moves.  Needs the same vertices in every frame
 
@@ -208,13 +210,21 @@ def bake(target, frames):
     bpy.data.objects.remove(target)
 
 
-def write(path, frames):
+def count_moving():
+    """Things with an action: objects, and meshes by their shape keys."""
+    keys = [o.data.shape_keys for o in of_type("MESH") if o.data.shape_keys]
+    things = list(bpy.context.scene.objects) + keys
+    return sum(bool(x.animation_data and x.animation_data.action) for x in things)
+
+
+def write(path, frames, merge):
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = frames
+    mode = {"export_nla_strips": not merge, "export_animation_mode": "ACTIVE_ACTIONS" if merge else "ACTIONS"}
     call(operator_of("export_scene.gltf"), filepath=path, export_format="GLB", export_yup=True, export_cameras=True,
          export_animations=True, export_force_sampling=True, export_frame_range=False, export_skins=True,
          export_all_influences=True, export_morph=True, export_morph_normal=True, export_apply=False,
-         export_optimize_animation_size=False, export_draco_mesh_compression_enable=False)
+         export_optimize_animation_size=False, export_draco_mesh_compression_enable=False, **mode)
 
 
 def options():
@@ -225,6 +235,7 @@ def options():
     p.add_argument("--rig")
     p.add_argument("--frames")
     p.add_argument("--fps", type=float)
+    p.add_argument("--merge", action="store_true")
     p.add_argument("--bake", action="store_true")
     if not words or "-h" in words or "--help" in words:
         print(__doc__)
@@ -268,7 +279,7 @@ def main():
             bake(mesh, frames)
     if not of_type("MESH"):
         raise Refused(f"{o.input}: no meshes")
-    write(output, frames)
+    write(output, frames, o.merge or count_moving() > 1)
     print(f"blender_export: {output}: frames {frames[0]} to {frames[1]}, {len(of_type('MESH'))} meshes")
 
 
