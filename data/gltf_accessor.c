@@ -54,7 +54,7 @@ static dar_status unpack(dar_gltf *g, dar_json packed, dar_gltf_bytes *view)
     const char *expected = dar_meshopt_check(&form);
     if (expected) return DAR_GLTF_REJECT(g, packed, NULL, "%s", expected);
     if (!from.data) return DAR_GLTF_REJECT(g, packed, "buffer", "one with data");
-    if (form.count > view->size / form.stride || form.count > MESHOPT_GROWTH * from.size)
+    if (form.count > view->size / form.stride || form.count > MESHOPT_GROWTH * from.size / form.stride)
         return DAR_GLTF_REJECT(g, packed, "count", "at most the %zu bytes of the view, and %d for each of %zu packed",
                                view->size, MESHOPT_GROWTH, from.size);
     DAR_TRY(dar_gltf_scratch(g, &out, form.count, form.stride));

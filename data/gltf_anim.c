@@ -109,11 +109,12 @@ static dar_status read_values(dar_gltf *g, dar_json sampler, dar_channel *c)
 }
 
 /* *used: whether the channel moves something that is known. */
-static dar_status read_channel(dar_gltf *g, dar_json j, dar_json samplers, dar_channel *c, bool *used)
+static dar_status read_channel(dar_gltf *g, dar_json j, const dar_json *samplers, size_t n_samplers, dar_channel *c,
+                               bool *used)
 {
     static const char *const modes[] = { "STEP", "LINEAR", "CUBICSPLINE", NULL };
     static const char *const paths[] = { "translation", "rotation", "scale", "weights" };
-    dar_json target = dar_json_object(j, "target"), sampler = dar_json_first(samplers);
+    dar_json target = dar_json_object(j, "target");
     const char *path = dar_json_text(target, "path", NULL);
     size_t which = dar_gltf_size(j, "sampler", 0, SIZE_MAX), known = 0;
     int node = dar_gltf_index(g, target, "node", DAR_GLTF_NODES);
@@ -125,8 +126,8 @@ static dar_status read_channel(dar_gltf *g, dar_json j, dar_json samplers, dar_c
         g->scene->notes.channels++;
         return DAR_OK;
     }
-    for (size_t i = 0; i < which && sampler.item; i++) sampler = dar_json_next(sampler);
-    if (!sampler.item) return DAR_GLTF_REJECT(g, j, "sampler", "one of %zu samplers", dar_json_size(samplers));
+    if (which >= n_samplers) return DAR_GLTF_REJECT(g, j, "sampler", "one of %zu samplers", n_samplers);
+    dar_json sampler = samplers[which];
     const dar_node *n = &g->scene->node[node];
     size_t targets = n->mesh == DAR_NONE ? 0 : g->scene->mesh[n->mesh].targets;
 
@@ -144,17 +145,20 @@ static dar_status read_channel(dar_gltf *g, dar_json j, dar_json samplers, dar_c
 
 static dar_status read_animation(dar_gltf *g, dar_json j, dar_animation *a)
 {
-    dar_json list = dar_json_array(j, "channels"), samplers = dar_json_array(j, "samplers");
+    dar_json list = dar_json_array(j, "channels"), samplers = dar_json_array(j, "samplers"), *sampler = NULL;
+    size_t n = dar_json_size(samplers), k = 0;
     dar_mark mark = dar_arena_mark(&g->scratch);
     unsigned char *seen;
 
     DAR_TRY(dar_gltf_name(g, j, &a->name));
     DAR_TRY(dar_gltf_take(g, &a->channel, dar_json_size(list), sizeof *a->channel));
     DAR_TRY(dar_gltf_scratch(g, &seen, g->length[DAR_GLTF_NODES], 1));
+    DAR_TRY(dar_gltf_scratch(g, &sampler, n, sizeof *sampler));
+    for (dar_json x = dar_json_first(samplers); x.item; x = dar_json_next(x)) sampler[k++] = x;
     for (dar_json x = dar_json_first(list); x.item; x = dar_json_next(x)) {
         dar_channel *c = &a->channel[a->channels];
         bool used;
-        DAR_TRY(read_channel(g, x, samplers, c, &used));
+        DAR_TRY(read_channel(g, x, sampler, n, c, &used));
         if (!used) continue;
         if (seen[c->node] >> c->path & 1)
             return DAR_GLTF_REJECT(g, x, "target", "a property that no other channel drives");

@@ -299,7 +299,7 @@ static dar_status fill_arrays(dar_gltf *g, dar_mesh *m, const struct part *part)
         const struct part *p = &part[i];
         dar_primitive *q = &m->primitive[i];
         dar_gltf_texture t = texture_of(g, p, q->material);
-        *q = (dar_primitive){ vertex, p->vertices, triangle, p->triangles, q->material, p->flat };
+        *q = (dar_primitive){ vertex, p->vertices, triangle, p->triangles, q->material, t.set != DAR_NONE, p->flat };
         DAR_TRY(dar_gltf_gather(g, &p->position, p->from, p->vertices, m->position + 3 * vertex));
         if (!p->flat) DAR_TRY(read_normals(g, p, m->normal + 3 * vertex));
         if (t.set != DAR_NONE) DAR_TRY(read_uv(g, p, &t, m->uv + 2 * vertex));

@@ -25,6 +25,7 @@ typedef struct dar_primitive {
     size_t vertex, vertices;    /* first and number among the mesh's vertices */
     size_t triangle, triangles; /* among the mesh's triangles */
     int material;               /* or DAR_NONE */
+    bool textured;              /* has texture coordinates; else the material's texture plays no part */
     bool flat;                  /* no normals given: vertices 3k .. 3k+2 are triangle k's alone and take its normal */
 } dar_primitive;
 

@@ -263,9 +263,9 @@ void dar_obj_triangulate(const float *vertex, const uint32_t *c, size_t n, uint3
 
     for (size_t i = 0; i < n && n > 3; i++) convex &= turn(&f, i, (i + 1) % n, (i + 2) % n) >= 0;
     for (size_t i = 0; i < n; i++) left[i] = (uint32_t)i;
-    for (size_t k = 0; n > 3 && n <= EARS && !convex; k = k < n ? k : 0) {
-        /* Once round without an ear: the polygon crosses itself, and any corner will do. */
-        for (size_t tried = 0; tried < n && !is_ear(&f, left, n, k); tried++) k = (k + 1) % n;
+    for (size_t k = 0, tried; n > 3 && n <= EARS && !convex; k = k < n ? k : 0) {
+        for (tried = 0; tried < n && !is_ear(&f, left, n, k); tried++) k = (k + 1) % n;
+        if (tried == n) break; /* it crosses itself: what is left becomes a fan */
         *out++ = left[(k + n - 1) % n];
         *out++ = left[k];
         *out++ = left[(k + 1) % n];

@@ -161,26 +161,34 @@ struct build {
     dar_arena scratch;
 };
 
-/* Number the pairs of vertex and normal in the order in which they are met. */
+static size_t table_size(size_t corners)
+{
+    size_t n = 16;
+    while (n < 2 * corners) n *= 2;
+    return n;
+}
+
+/* Number the pairs of vertex and normal in the order in which they are met, by a table with open addresses. */
 static size_t number_pairs(struct build *b)
 {
     const dar_obj *o = &b->first;
-    size_t n = 0;
     dar_mark mark = dar_arena_mark(&b->scratch);
-    uint32_t *head = dar_arena_push(&b->scratch, o->vertices * sizeof *head); /* pairs of a vertex form a chain */
-    uint32_t *next = dar_arena_push(&b->scratch, o->corners * sizeof *next);
+    size_t n = 0, size = table_size(o->corners);
+    uint32_t *table = dar_arena_push(&b->scratch, size * sizeof *table);
 
-    memset(head, 0xff, o->vertices * sizeof *head);
+    memset(table, 0xff, size * sizeof *table);
     for (size_t i = 0; i < o->corners; i++) {
-        uint32_t normal = o->has_normals ? o->corner_normal[i] : 0, k = head[o->corner[i]];
-        while (k != DAR_OBJ_NONE && o->has_normals && o->corner_normal[b->corner[k]] != normal) k = next[k];
-        if (k == DAR_OBJ_NONE) {
-            k = (uint32_t)n++;
-            b->corner[k] = (uint32_t)i;
-            next[k] = head[o->corner[i]];
-            head[o->corner[i]] = k;
+        uint32_t v = o->corner[i], normal = o->has_normals ? o->corner_normal[i] : 0, first = 0;
+        size_t at = ((uint64_t)v * 0x9e3779b97f4a7c15u + (uint64_t)normal * 0xc2b2ae3d27d4eb4fu) >> 32 & (size - 1);
+        for (; table[at] != DAR_OBJ_NONE; at = (at + 1) & (size - 1)) {
+            first = b->corner[table[at]];
+            if (o->corner[first] == v && (!o->has_normals || o->corner_normal[first] == normal)) break;
         }
-        b->pair[i] = k;
+        if (table[at] == DAR_OBJ_NONE) {
+            b->corner[n] = (uint32_t)i;
+            table[at] = (uint32_t)n++;
+        }
+        b->pair[i] = table[at];
     }
     dar_arena_reset(&b->scratch, mark);
     return n;
@@ -288,7 +296,7 @@ static dar_status start_scene(struct build *b, const char *path, double fps, dar
     const dar_obj *o = &b->first;
     dar_scene *s = b->scene;
     size_t n = b->frames, targets = n > 1 ? n : 0, triangles = o->corners - 2 * o->faces;
-    size_t scratch = dar_mul_size(o->corners, 16) + dar_mul_size(o->vertices, 28) + 8 * DAR_ALIGN;
+    size_t scratch = 8 * o->corners + 4 * table_size(o->corners) + 24 * o->vertices + 8 * DAR_ALIGN;
 
     DAR_TRY(dar_arena_init(&b->scratch, "OBJ scratch", scratch, e));
     b->pair = dar_arena_push(&b->scratch, o->corners * sizeof *b->pair);

@@ -4,12 +4,12 @@
 
     INPUT             .blend .fbx .bvh .abc .usd* .dae .obj .ply .stl .x3d .gltf .glb
     -o OUT.glb        default: INPUT with .glb instead of its suffix
-    --rig FILE        a model with a skeleton, of any of the kinds above, that a .bvh moves: bones are matched by name.
-                      Without it a .bvh becomes sticks, one for each bone
+    --rig FILE        a model with a skeleton, of any of the kinds above, that a .bvh moves: bones are matched by
+                      name.  Without it a .bvh becomes sticks, one for each bone
     --frames A:B      default: the scene's, or those that the file's animation covers
     --fps N           default: the scene's, of a .bvh 1 / its frame time
-    --merge           all that moves becomes one animation, as the scene plays.  Done by itself when several things move;
-                      otherwise every action of the one that does is an animation with its name
+    --merge           all that moves becomes one animation, as the scene plays.  Done by itself when several things
+                      move; otherwise every action of the one that does is an animation with its name
     --bake            meshes frame by frame, as morph targets: whatever deforms them (simulations, lattices, drivers).
                       Done by itself for meshes that Alembic or USD moves.  Needs the same vertices in every frame
 

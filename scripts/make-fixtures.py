@@ -138,8 +138,8 @@ def gltf_files():
             accessors.append({"bufferView": len(views) - 1, "type": kind, "componentType": component,
                               "count": len(x) // width[kind], **(more[0] if more else {})})
             data += raw + bytes(-len(raw) % 4)
-        top = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": len(data)}] if data else [], "bufferViews": views,
-               "accessors": accessors, **rest}
+        buffers = [{"byteLength": len(data)}] if data else []
+        top = {"asset": {"version": "2.0"}, "buffers": buffers, "bufferViews": views, "accessors": accessors, **rest}
         return json.dumps({k: v for k, v in top.items() if v}, separators=(",", ":")).encode() + b"\0" + data
 
     x = ("VEC3", 5126, [0, 0, 0, 1, 0, 0, 0, 1, 0])
@@ -165,7 +165,8 @@ def gltf_files():
         "indexed": file([x, n, ("SCALAR", 5121, [2, 1, 0])], meshes=mesh(indices=2), nodes=nodes),
         "strip": file([x, n], meshes=mesh(mode=5), nodes=nodes),
         "tree": file([x, n], meshes=mesh(), scenes=[{"nodes": [0]}], scene=0, nodes=[
-            {"children": [1], "scale": [1, -2, 1]}, {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]}]),
+            {"children": [1], "scale": [1, -2, 1]},
+            {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]}]),
         "cycle": file([], nodes=[{"children": [1]}, {"children": [0]}]),
         "zero_scale": file([x, n], meshes=mesh(), nodes=[{"mesh": 0, "scale": [0, 0, 0]}]),
         "step": file([x, n, times, ("VEC3", 5126, [0, 0, 0, 1, 2, 3])], meshes=mesh(), nodes=nodes,
@@ -175,7 +176,8 @@ def gltf_files():
         "morph": file([x, n, times, ("SCALAR", 5126, [0, 1])], meshes=mesh(targets=[{"POSITION": 1, "NORMAL": 0}]),
                       nodes=nodes, animations=animation("weights", "LINEAR")),
         "skin": file([x, n, times, turn, joints, weights], meshes=skinned, skins=[{"joints": [1, 2]}],
-                     nodes=[{"mesh": 0, "skin": 0}, {"children": [2]}, {}], animations=animation("rotation", "LINEAR", 2)),
+                     nodes=[{"mesh": 0, "skin": 0}, {"children": [2]}, {}],
+                     animations=animation("rotation", "LINEAR", 2)),
         "sparse": file([x, n, ("SCALAR", 5121, [1]), ("VEC3", 5126, [7, 8, 9])], meshes=mesh(), nodes=nodes).replace(
             b'"count":3}', b'"count":3,"sparse":' + json.dumps(sparse).encode() + b"}", 1),
         "cameras": file([], nodes=[{"camera": 0}, {"camera": 1}], cameras=[

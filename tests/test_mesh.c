@@ -407,6 +407,7 @@ static void materials(void **state)
     assert_int_equal(m->wrap_v, DAR_WRAP_MIRROR);
     assert_int_equal(m->alpha, DAR_ALPHA_MASK);
     assert_true(m->nearest && m->double_sided);
+    assert_true(s.mesh[0].primitive[0].textured);
     CHECK_NEAR("cutoff", m->cutoff, 0.25, 0);
     CHECK_NEAR("factor", m->color[1], 0.25, 0);
     assert_int_equal(s.image[1].width, 2);
