@@ -17,7 +17,7 @@ for t in "$@"; do
     p=$(grep -c '^\[       OK \]' "$build/$t.log")
     s=$(grep -c '^\[  SKIPPED \] [^0-9]' "$build/$t.log")
     f=$(grep -c '^\[  FAILED  \] [^0-9]' "$build/$t.log")
-    f=$((f / 2)) # cmocka names each twice
+    s=$((s / 2)) f=$((f / 2)) # cmocka names each twice
     if [ $status -ne 0 ]; then
         [ $f -eq 0 ] && f=1
         bad=1
