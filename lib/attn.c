@@ -337,8 +337,8 @@ void dar_attn_forward(const dar_attn *a)
 
 /* ---------------------------------------------------------------- backward */
 
-#define QUERIES    128 /* queries of a block */
-#define ROWS_BACK  128 /* keys of a block */
+#define QUERIES    96 /* queries of a block: whole tiles of 6, 8 or 12 rows */
+#define ROWS_BACK  96 /* keys of a block */
 #define CHUNK_SIZE (1 << 18)
 
 /* Keys that a task packs, and whose gradients it sums, at a time. */
@@ -396,7 +396,7 @@ static struct job backward_job(const dar_attn *a)
     bool keys = a->gk.data || a->gv.data;
 
     j.range = keys ? round_up(j.Nq, QUERIES) : range_of(j.Nq, parts, QUERIES, 4 * QUERIES, 32 * QUERIES);
-    j.split = keys ? range_of(j.Nk, parts, ROWS_BACK, 3 * ROWS_BACK, SIZE_MAX) : round_up(j.Nk, ROWS_BACK);
+    j.split = keys ? range_of(j.Nk, parts, ROWS_BACK, 4 * ROWS_BACK, SIZE_MAX) : round_up(j.Nk, ROWS_BACK);
     j.ranges = j.range ? ceil_div(j.Nq, j.range) : 0;
     if (keys) j.ranges = 1; /* no query: their gradients are 0 */
     j.splits = j.split ? ceil_div(j.Nk, j.split) : 0;
