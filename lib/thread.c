@@ -29,15 +29,15 @@ void dar_parallel(size_t tasks, dar_task *fn, void *ctx)
 {
     int n = dar_threads();
 
-    if ((size_t)n > tasks) n = (int)tasks;
-    if (n <= 1 || omp_in_parallel()) {
+    if (n == 1 || tasks <= 1 || omp_in_parallel()) {
         for (size_t i = 0; i < tasks; i++) fn(ctx, i, self);
         return;
     }
+    /* Always the same team, however few the tasks: a smaller one would end threads that the next call starts again. */
 #pragma omp parallel num_threads(n)
     {
         self = omp_get_thread_num();
-#pragma omp for schedule(dynamic, 1)
+#pragma omp for schedule(dynamic, 1) nowait
         for (size_t i = 0; i < tasks; i++) fn(ctx, i, self);
         self = 0;
     }
