@@ -1,6 +1,7 @@
 /* product.c: how a product is cut.
  *
- *   columns of C in panels      so that B, packed over all of k, fits PANEL_BYTES; packed once, shared by all threads
+ *   k in spans                  of SPAN_UNITS, the later ones adding to C; one only where sums are kept apart from C
+ *   columns of C in panels      so that B, packed over a span, fits PANEL_BYTES; packed once, shared by all threads
  *   a panel in tasks            about TASK_ROWS rows each; where there are few rows, columns are split too
  *   k in blocks                 a stripe of B over a block and a task's rows of A stay in the second-level cache
  *   tiles                       along the rows first: the stripe of B is read again and again, A streams past it
@@ -15,10 +16,14 @@
 #include "lib/status.h"
 #include "lib/thread.h"
 
-#define TASK_ROWS        96
+#define THIN_ROWS        96
+#define TASK_ROWS        192
+#define TASK_ROWS_APART  96 /* where sums are kept apart from C */
 #define BLOCK_UNITS      512
 #define BLOCK_UNITS_THIN 128
-#define PANEL_BYTES      ((size_t)24 << 20)
+#define SPAN_UNITS       1024
+#define PANEL_BYTES      ((size_t)12 << 20)
+#define GROUP            16 /* stripes packed together, each read in long pieces */
 #define ALIAS            4096
 #define PIECE_BYTES      ((size_t)256 << 10) /* of B, packed by a thin task */
 #define ACC_COLS         384                 /* columns summed in scratch at a time */
@@ -35,9 +40,12 @@ struct plan {
     size_t kc[2];      /* elements per block of each term */
     size_t blocks;     /* of both terms */
     size_t depth;      /* most units in a block */
+    size_t spans;      /* of blocks, whose B is packed at a time */
     size_t shared_bytes, a_bytes, b_bytes, c_bytes;
     char *shared, *own; /* own: a_bytes, b_bytes, c_bytes for each thread */
+    size_t b0, b1;      /* blocks of the span */
     size_t first;       /* stripe of B where the panel begins */
+    size_t groups;      /* of stripes, packed by one task each */
 };
 
 static size_t ceil_div(size_t a, size_t b)
@@ -88,13 +96,15 @@ static void cut(struct plan *s, const dar_product *p)
     size_t threads = (size_t)dar_threads();
 
     *s = (struct plan){ .p = p, .t = t, .rows = ceil_div(p->m, t->mr), .cols = ceil_div(p->n, t->nr) };
-    s->thin = p->m <= TASK_ROWS;
+    s->thin = p->m <= THIN_ROWS;
+    s->spans = 1;
     cut_k(s, s->thin ? BLOCK_UNITS_THIN : BLOCK_UNITS);
 
     size_t stripe_a = s->depth * t->mr * t->unit_bytes, stripe_b = s->depth * t->nr * t->unit_bytes;
     size_t elem = t->kind == DAR_TILE_F64 ? 8 : 4;
     bool pack_a = (p->term[0].k && !p->term[0].a.in_place) || (p->term[1].k && !p->term[1].a.in_place);
-    size_t want = threads * (s->thin || pack_a ? 2 : 8); /* tasks: many even out, few pack less often */
+    size_t task_rows = p->direct ? TASK_ROWS : TASK_ROWS_APART;
+    size_t want = threads * (s->thin ? 2 : pack_a ? 1 : 8); /* tasks: many even out, few pack less often */
 
     if (s->thin) {
         s->panel = s->cols;
@@ -103,15 +113,17 @@ static void cut(struct plan *s, const dar_product *p)
         s->tn = min(s->cols, s->tn < want ? want : ceil_div(s->tn, threads) * threads);
         s->piece = ceil_div(s->cols, s->tn);
     } else {
-        size_t fit = 1 + PANEL_BYTES / (s->blocks * stripe_b);
+        size_t units = dar_tile_units(t, p->term[0].k) + dar_tile_units(t, p->term[1].k);
+        if (p->direct && units > SPAN_UNITS) s->spans = min(s->blocks, units / SPAN_UNITS);
+        size_t fit = 1 + PANEL_BYTES / (ceil_div(s->blocks, s->spans) * stripe_b);
         s->panel = ceil_div(s->cols, ceil_div(s->cols, fit));
-        s->tm = ceil_div(p->m, TASK_ROWS);
+        s->tm = ceil_div(p->m, task_rows);
         if (s->tm > threads) s->tm = min(s->rows, ceil_div(s->tm, threads) * threads);
         s->tn = min(s->panel, ceil_div(want, s->tm));
         s->piece = p->direct ? s->panel : min(s->panel, 1 + (ACC_COLS - 1) / t->nr);
     }
     s->task_rows = ceil_div(s->rows, s->tm);
-    s->shared_bytes = align(s->blocks * (s->thin ? s->rows * stripe_a : s->panel * stripe_b));
+    s->shared_bytes = align(ceil_div(s->blocks, s->spans) * (s->thin ? s->rows * stripe_a : s->panel * stripe_b));
     s->a_bytes = s->thin || !pack_a ? 0 : align(s->task_rows * stripe_a);
     s->b_bytes = s->thin ? align(s->piece * stripe_b) : 0;
     s->c_bytes = p->direct ? 0 : align(s->task_rows * t->mr * s->piece * t->nr * elem);
@@ -154,16 +166,23 @@ static void pack(const struct plan *s, bool of_a, size_t begin, size_t end, size
 static char *shared_block(const struct plan *s, size_t b)
 {
     size_t stripes = s->thin ? s->rows : s->panel, wide = s->thin ? s->t->mr : s->t->nr;
-    return s->shared + b * stripes * s->depth * wide * s->t->unit_bytes;
+    return s->shared + (b - s->b0) * stripes * s->depth * wide * s->t->unit_bytes;
 }
 
-static void pack_shared(void *ctx, size_t begin, size_t end, int thread)
+static void pack_shared(void *ctx, size_t i, int thread)
 {
     const struct plan *s = ctx;
-    size_t first = s->thin ? 0 : s->first;
+    size_t all = s->thin ? s->rows : min(s->panel, s->cols - s->first), first = s->thin ? 0 : s->first;
+    size_t b = s->b0 + i / s->groups, g = i % s->groups, begin = all * g / s->groups, end = all * (g + 1) / s->groups;
     (void)thread;
-    for (size_t b = 0; b < s->blocks; b++)
-        pack(s, s->thin, first + begin, first + end, b, shared_block(s, b) + begin * stripe_bytes(s, s->thin, b));
+    pack(s, s->thin, first + begin, first + end, b, shared_block(s, b) + begin * stripe_bytes(s, s->thin, b));
+}
+
+static void share(struct plan *s, size_t stripes)
+{
+    size_t blocks = s->b1 - s->b0, many = ceil_div(4 * (size_t)dar_threads(), blocks), wide = ceil_div(stripes, GROUP);
+    s->groups = min(stripes, many > wide ? many : wide);
+    dar_parallel(blocks * s->groups, pack_shared, s);
 }
 
 /* ---------------------------------------------------------------- multiplying */
@@ -221,7 +240,7 @@ static void multiply(void *ctx, size_t i, int thread)
     w.r1 = s->rows * (r + 1) / s->tm;
     for (w.c0 = s->first + panel * c / s->tn; w.c0 < end; w.c0 = w.c1) {
         w.c1 = min(w.c0 + s->piece, end);
-        for (size_t b = 0; b < s->blocks; b++) {
+        for (size_t b = s->b0; b < s->b1; b++) {
             if (s->thin) pack(s, false, w.c0, w.c1, b, w.b);
             else pack(s, true, w.r0, w.r1, b, w.a);
             multiply_block(s, &w, b);
@@ -236,14 +255,19 @@ void dar_product_run(const dar_product *p, void *scratch)
     cut(&s, p);
     s.shared = scratch;
     s.own = s.shared + s.shared_bytes;
+    s.b1 = s.blocks;
     if (s.thin) {
-        dar_parallel_range(s.rows, 1, pack_shared, &s);
+        share(&s, s.rows);
         dar_parallel(s.tn, multiply, &s);
         return;
     }
-    for (; s.first < s.cols; s.first += s.panel) {
-        size_t panel = min(s.panel, s.cols - s.first);
-        dar_parallel_range(panel, 1 + panel / (8 * (size_t)dar_threads()), pack_shared, &s);
-        dar_parallel(s.tm * s.tn, multiply, &s);
+    for (size_t i = 0; i < s.spans; i++) {
+        s.b0 = s.blocks * i / s.spans;
+        s.b1 = s.blocks * (i + 1) / s.spans;
+        for (s.first = 0; s.first < s.cols; s.first += s.panel) {
+            size_t panel = min(s.panel, s.cols - s.first);
+            share(&s, panel);
+            dar_parallel(s.tm * s.tn, multiply, &s);
+        }
     }
 }

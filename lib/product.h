@@ -18,8 +18,7 @@
 typedef struct dar_operand {
     /* Write lanes [at, at + n) over elements [k0, k0 + k) of the sum as a packed stripe of t, mr or nr wide, filled up
      * with zeros; if `many`, n may be more: as stripes one after the other (dar_tile_pack_* do either).  `at` is a
-     * multiple of the width, k0 of the unit.  Runs on any thread; each lane of B is asked for once per block of k, in
-     * ascending k, by one thread. */
+     * multiple of the width, k0 of the unit.  Runs on any thread; each lane of B is asked for once per block of k. */
     void (*pack)(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *stripes);
     bool many;
     const void *ctx;
