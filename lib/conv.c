@@ -3,6 +3,7 @@
 
 #include <string.h>
 
+#include "lib/conv_fold.h"
 #include "lib/kern.h"
 #include "lib/thread.h"
 #include "lib/tile.h"
@@ -163,6 +164,7 @@ static struct job job_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar
 
 size_t dar_conv_scratch(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_dtype w, int threads)
 {
+    if (pass == DAR_CONV_FORWARD && dar_conv_fold_fits(c)) return dar_conv_fold_scratch(c, x, w, threads);
     struct job j = job_of(c, pass, x, w);
     return j.shared + (size_t)threads * own_bytes(&j);
 }
@@ -525,6 +527,10 @@ static struct clip clip_of_y(const dar_conv *c, const dar_tensor *y)
 void dar_conv_forward(const dar_conv *c, const dar_tensor *x, const dar_tensor *w, const dar_tensor *b,
                       const dar_tensor *history, const dar_tensor *y, void *scratch)
 {
+    if (dar_conv_fold_fits(c)) { /* few channels */
+        dar_conv_fold_forward(c, x, w, b, history, y, scratch);
+        return;
+    }
     struct correlate f = { .j = job_of(c, DAR_CONV_FORWARD, x->dtype, w->dtype),
                            .in = clip_of(c, x, history),
                            .out = clip_of_y(c, y),

@@ -4,6 +4,7 @@
  * col, the shifted input rows, exists only in pieces that fit the second-level cache.  gw^T = col gy^T.  gx is the
  * convolution of gy with the kernel turned round; where a stride is not 1, gcol = w^T gy, added back to where the taps
  * came from.  A frame alone is T = kt = To = 1.
+ * To few channels, y is made without col: lib/conv_fold.h.
  *
  * Products run in bf16 if x and w are stored so, else in x's arithmetic type; sums in that type, k ascending in fixed
  * blocks, so a frame's result depends neither on the number of threads nor on the frames it is evaluated with. */

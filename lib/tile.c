@@ -162,6 +162,12 @@ void dar_tile_pack_b_kn(const dar_tile *t, dar_dtype src_type, const void *src, 
     pack(t, false, src_type, src, ld, n, k, t->nr, dst);
 }
 
+void dar_tile_pack_b_wide(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
+                          size_t wide, void *dst)
+{
+    pack(t, false, src_type, src, ld, n, k, wide, dst);
+}
+
 void dar_tile_pack_b_nk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
                         void *dst)
 {

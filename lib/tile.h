@@ -77,6 +77,10 @@ void dar_tile_pack_b_kn(const dar_tile *t, dar_dtype src_type, const void *src, 
 void dar_tile_pack_b_nk(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
                         void *dst);
 
+/* As b_kn, into stripes of `wide` columns: mm reads such a stripe from any column with b_k = wide. */
+void dar_tile_pack_b_wide(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
+                          size_t wide, void *dst);
+
 /* Fill the table for a set of DAR_CPU_ flags; called by dar_cpu_init. */
 void dar_tile_init(unsigned cpu_flags);
 

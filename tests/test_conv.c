@@ -72,6 +72,9 @@ static const struct shape_of_conv shapes[] = {
     { "time stride 2, one frame known", 1, 3, 4, 2, 3, 1, 5, 3, 1, 1, { 1, 0, 0, 0, 0, 2, 1 } },
     { "many channels", 1, 61, 1, 5, 7, 0, 530, 1, 3, 3, { 1, 1, 1, 1, 1, 1, 0 } },
     { "many pixels", 1, 2, 5, 47, 43, 1, 3, 2, 3, 3, { 1, 1, 1, 1, 1, 1, 1 } },
+    { "many pixels, 44 channels", 1, 2, 2, 19, 43, 1, 44, 2, 3, 3, { 1, 1, 1, 1, 1, 1, 1 } },
+    { "causal to 47 channels", 2, 4, 2, 3, 5, 1, 47, 3, 3, 3, { 1, 1, 1, 1, 1, 1, 2 } },
+    { "261 channels to 2, lopsided", 1, 261, 2, 3, 5, 1, 2, 3, 3, 4, { 1, 2, 0, 3, 0, 1, 2 } },
 };
 
 struct values {

@@ -164,7 +164,8 @@ static const dar_sample conv2d_samples[] = {
     { .in = { { 4, { 1, 2, 2, 1 } }, { 4, { 2, 2, 3, 3 } }, { .n = -1 } }, .attr = &wide_border }, /* mostly zero */
     { .in = { { 5, { 2, 2, 3, 4, 5 } }, { 4, { 3, 2, 3, 3 } }, { 1, { 3 } } }, .attr = &same_3 },  /* frame by frame */
     { .in = { { 5, { 1, 2, 2, 4, 6 } }, { 4, { 3, 2, 3, 3 } }, { .n = -1 } }, .attr = &vae_down },
-    { .in = { { 4, { 1, 67, 9, 33 } }, { 4, { 13, 67, 3, 3 } }, { 1, { 13 } } }, .attr = &same_3 }, /* several blocks */
+    { .in = { { 4, { 1, 67, 9, 33 } }, { 4, { 43, 67, 3, 3 } }, { 1, { 43 } } }, .attr = &same_3 }, /* several blocks */
+    { .in = { { 4, { 1, 3, 17, 33 } }, { 4, { 2, 3, 3, 3 } }, { 1, { 2 } } }, .attr = &same_3 }, /* to few channels */
 };
 
 static const dar_error_sample conv2d_errors[] = {
