@@ -426,15 +426,15 @@ static void store(const struct correlate *f, size_t o0, size_t m, size_t q0, siz
 {
     const struct job *j = &f->j;
     const struct clip *v = &f->out;
+    const dar_kern *k = dar_kern_for(j->sum);
     size_t size = dar_dtype_size(j->sum), past = v->P * v->plane;
+    dar_put mode = dar_put_for(v->x->data ? dar_tensor_bytes(v->x) : 0, f->add);
+    dar_put mode_past = f->add_past ? DAR_PUT_ADD : DAR_PUT;
 
     for (size_t o = 0; o < m; o++) {
         char *row = c + o * j->n * size;
         double bias = f->b && f->b->data ? dar_dtype_get(f->b->dtype, f->b->data, o0 + o) : 0;
-        if (j->sum == DAR_F64)
-            for (size_t i = 0; i < n; i++) ((double *)(void *)row)[i] += bias;
-        else
-            for (size_t i = 0; i < n; i++) ((float *)(void *)row)[i] += (float)bias;
+        if (f->b && f->b->data) k->offset(n, bias, row, row);
         for (size_t i = 0, length; i < n; i += length) {
             size_t batch = (q0 + i) / j->P, p = (q0 + i) % j->P;
             bool before = p < past;
@@ -443,7 +443,7 @@ static void store(const struct correlate *f, size_t o0, size_t m, size_t q0, siz
             if (!to->data) continue;
             size_t at = (batch * v->C + o0 + o) * (before ? past : j->P - past) + (before ? p : p - past);
             dar_row_put(j->sum, row + i * size, to->dtype, (char *)to->data + at * dar_dtype_size(to->dtype), length,
-                        (before ? f->add_past : f->add) ? DAR_PUT_ADD : DAR_PUT);
+                        before ? mode_past : mode);
         }
     }
 }
