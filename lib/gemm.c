@@ -142,6 +142,7 @@ struct finish {
     dar_dtype bias_type;
     void *pre;
     void (*act)(size_t n, const void *x, void *y);
+    void (*put)(size_t n, const void *x, void *dst, bool stream); /* real to type */
 };
 
 static void finish_row(const struct finish *f, size_t i, size_t j, size_t n, void *x)
@@ -179,8 +180,14 @@ static void fetch_rows(const struct finish *f, size_t i, size_t j, size_t m, siz
 static void finish_tile(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
 {
     const struct finish *f = ctx;
+    bool plain = f->alpha == 1 && !f->bias && !f->pre && !f->act && !f->add;
+    size_t size = dar_dtype_size(f->type), row = ldc * dar_dtype_size(f->real);
+    char *x = c, *y = (char *)f->c + (i * f->ldc + j) * size;
     if (f->type != f->real) fetch_rows(f, i + m, j, m, n);
-    for (size_t r = 0; r < m; r++) finish_row(f, i + r, j, n, (char *)c + r * ldc * dar_dtype_size(f->real));
+    for (size_t r = 0; r < m; r++, x += row, y += f->ldc * size) {
+        if (!plain) finish_row(f, i + r, j, n, x);
+        else if (x != y) f->put(n, x, y, false);
+    }
 }
 
 /* The tile holds columns of C as rows. */
@@ -217,7 +224,8 @@ static void describe(const dar_gemm *g, struct finish *f, dar_product *p)
     dar_dtype real = g->kind == DAR_TILE_F64 ? DAR_F64 : DAR_F32;
     bool flip = better_transposed(g, t);
 
-    *f = (struct finish){ g->alpha, real, g->type, g->c, g->ldc, g->n, g->add, g->bias, g->bias_type, g->pre, g->act };
+    *f = (struct finish){ g->alpha, real,    g->type,      g->c,   g->ldc, g->n,
+                          g->add,   g->bias, g->bias_type, g->pre, g->act, dar_kern_for(real)->put[g->type] };
     *p = (dar_product){ .tile = t, .m = g->m, .n = g->n, .done = finish_tile, .ctx = f };
     if (flip) {
         *p = (dar_product){ choose_tile(g->kind, g->n, g->m), g->n, g->m, .done = finish_transposed, .ctx = f };
@@ -273,6 +281,7 @@ struct i8 {
     size_t row;      /* k in whole units */
     float *scale;    /* [m] */
     int32_t *offset; /* [n]: 128 sum w */
+    void (*scale_sums)(size_t n, const int32_t *sum, const int32_t *offset, float a, const float *b, void *y);
     dar_matrix a, b;
 };
 
@@ -307,14 +316,11 @@ static void finish_i8(const void *ctx, size_t i, size_t j, size_t m, size_t n, v
     const struct i8 *s = ctx;
     const int32_t *offset = s->offset + j;
     const float *w_scale = s->g->w_scale + j;
-    float row[BLAS_COLS];
-    if (s->f.type != DAR_F32) fetch_rows(&s->f, i + m, j, m, n);
     for (size_t r = 0; r < m; r++) {
-        const int32_t *sum = (const int32_t *)c + r * ldc;
-        float scale = s->scale[i + r];
-        for (size_t q = 0; q < n; q++) row[q] = (float)(sum[q] - offset[q]) * (scale * w_scale[q]);
-        finish_row(&s->f, i + r, j, n, row);
+        int32_t *sum = (int32_t *)c + r * ldc;
+        s->scale_sums(n, sum, offset, s->scale[i + r], w_scale, sum);
     }
+    finish_tile(&s->f, i, j, m, n, c, ldc);
 }
 
 /* Returns the bytes of scratch in front of the product's own. */
@@ -324,8 +330,9 @@ static size_t describe_i8(const dar_gemm_i8 *g, struct i8 *s, dar_product *p, ch
     size_t row = (g->k + DAR_ALIGN - 1) / DAR_ALIGN * DAR_ALIGN;
     size_t scale = g->m * row, offset = scale + g->m * sizeof(float), end = offset + g->n * sizeof(int32_t);
 
-    *s = (struct i8){ .g = g, .row = row };
-    s->f = (struct finish){ 1, DAR_F32, g->type, g->c, g->ldc, g->n, false, g->bias, g->bias_type, g->pre, g->act };
+    *s = (struct i8){ .g = g, .row = row, .scale_sums = dar_kern_for(DAR_F32)->scale_sums };
+    s->f = (struct finish){ 1,     DAR_F32, g->type,      g->c,   g->ldc, g->n,
+                            false, g->bias, g->bias_type, g->pre, g->act, dar_kern_for(DAR_F32)->put[g->type] };
     if (scratch) {
         s->q = (uint8_t *)scratch;
         s->scale = (float *)(void *)(scratch + scale);
@@ -356,7 +363,7 @@ void dar_gemm_i8_run(const dar_gemm_i8 *g, void *scratch)
     dar_product p;
     DAR_ASSERT(g->k <= 65536, "gemm: %zu products of 8 bits do not fit a 32-bit sum", g->k);
     size_t own = describe_i8(g, &s, &p, scratch);
-    dar_parallel_range(g->m, 8, quantise_rows, &s);
-    dar_parallel_range(g->n, 16, sum_rows, &s);
+    dar_parallel_range(g->m, 64, quantise_rows, &s);
+    dar_parallel_range(g->n, 64, sum_rows, &s);
     dar_product_run(&p, (char *)scratch + own);
 }

@@ -94,9 +94,13 @@ typedef struct dar_kern {
     /* w, m, v in place. */
     void (*adamw)(size_t n, const dar_adamw *a, void *w, void *m, void *v, const void *g);
 
-    /* q = x / scale to the nearest, ties to even, in [-127, 127]; and back.  scale 0 or not finite: q = 0. */
+    /* q = x (1 / scale) to the nearest, ties to even, in [-127, 127]; and back.  q = 0 where scale is not finite or
+     * 1 / scale is not. */
     void (*quantise)(size_t n, const void *x, float scale, int8_t *q);
     void (*dequantise)(size_t n, const int8_t *q, float scale, void *x);
+
+    /* y = (sum - offset) (a b): sums of 8-bit products times the scales of their row and columns. */
+    void (*scale_sums)(size_t n, const int32_t *sum, const int32_t *offset, float a, const float *b, void *y);
 } dar_kern;
 
 /* The table for arithmetic in t: DAR_F32 or DAR_F64. */
@@ -133,8 +137,8 @@ static inline void dar_row_ahead(const void *p, size_t bytes)
     for (size_t i = 0; i < bytes; i += 64) __builtin_prefetch((const char *)p + i);
 }
 
-/* Quantise n stored elements: q = x / scale, scale = max |x| / 127.  A zero row gives scale 0; a row that is not finite
- * gives zeros with scale NaN, so that it stays visible.  Returns the scale. */
+/* Quantise n stored elements: q = x / scale, scale = max |x| / 127.  A zero row, or one below 2^-119, gives
+ * scale 0; a row that is not finite gives zeros with scale NaN, so that it stays visible.  Returns the scale. */
 float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q);
 
 /* A step of AdamW over n parameters w with gradients g of arithmetic type c; the moments m, v are stored as `moments`.

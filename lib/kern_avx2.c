@@ -51,6 +51,12 @@ static inline vf v_min(vf a, vf b)
     return _mm256_min_ps(a, b);
 }
 
+/* The larger as unsigned integers. */
+static inline vf v_max_bits(vf a, vf b)
+{
+    return _mm256_castsi256_ps(_mm256_max_epu32(_mm256_castps_si256(a), _mm256_castps_si256(b)));
+}
+
 static inline vf v_sqrt(vf x)
 {
     return _mm256_sqrt_ps(x);
@@ -177,6 +183,13 @@ static inline vh v_to_f16(vf x)
 static inline vf v_from_i8(const int8_t *p)
 {
     return _mm256_cvtepi32_ps(_mm256_cvtepi8_epi32(_mm_loadl_epi64((const void *)p)));
+}
+
+/* LANES whole numbers a - b. */
+static inline vf v_difference(const int32_t *a, const int32_t *b)
+{
+    return _mm256_cvtepi32_ps(
+        _mm256_sub_epi32(_mm256_loadu_si256((const void *)a), _mm256_loadu_si256((const void *)b)));
 }
 
 /* Whole numbers in [-127, 127]. */

@@ -51,6 +51,12 @@ static inline vf v_min(vf a, vf b)
     return _mm512_min_ps(a, b);
 }
 
+/* The larger as unsigned integers. */
+static inline vf v_max_bits(vf a, vf b)
+{
+    return _mm512_castsi512_ps(_mm512_max_epu32(_mm512_castps_si512(a), _mm512_castps_si512(b)));
+}
+
 static inline vf v_sqrt(vf x)
 {
     return _mm512_sqrt_ps(x);
@@ -175,6 +181,12 @@ static inline vh v_to_f16(vf x)
 static inline vf v_from_i8(const int8_t *p)
 {
     return _mm512_cvtepi32_ps(_mm512_cvtepi8_epi32(_mm_loadu_si128((const void *)p)));
+}
+
+/* LANES whole numbers a - b. */
+static inline vf v_difference(const int32_t *a, const int32_t *b)
+{
+    return _mm512_cvtepi32_ps(_mm512_sub_epi32(_mm512_loadu_si512(a), _mm512_loadu_si512(b)));
 }
 
 /* Whole numbers in [-127, 127]. */

@@ -112,6 +112,18 @@ CALL(quantise_saturates, k->quantise(n, x[0], 0.001f, x[1]))
 CALL(quantise_nothing, k->quantise(n, x[0], 0, x[1]))
 CALL(dequantise, k->quantise(n, x[0], 0.0042f, x[1]); k->dequantise(n, x[1], 0.0042f, x[2]))
 
+static void call_scale_sums(const dar_kern *k, size_t n, struct rows *s)
+{
+    static int32_t sum[LONGEST], offset[LONGEST];
+    static float b[LONGEST];
+    for (uint32_t i = 0; i < n; i++) {
+        sum[i] = (int32_t)noise(i) >> 4;
+        offset[i] = (int32_t)noise(i + 7) >> 4;
+        b[i] = (float)((int32_t)noise(i + 3) * 0x1p-31);
+    }
+    k->scale_sums(n, sum, offset, 0x1p-29f, b, s->row[2]);
+}
+
 static const struct {
     const char *name;
     kernel_call *call;
@@ -148,6 +160,7 @@ static const struct {
     EXACT(rope_long, 3 * 2),
     EXACT(adamw, 40), /* rate fix1 m / (sqrt(v fix2) + eps) is 20 at most; 14 roundings, most of less */
     EXACT(dequantise, 2),
+    EXACT(scale_sums, 3),
 };
 
 /* Row 1 holds bytes: only the bits of f32 are compared. */
