@@ -17,14 +17,14 @@
  * so bits do not depend on their number. */
 #define DEF_BLAS(NAME, REAL, GEMM)                                                                                     \
     static void NAME(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c,            \
-                     size_t ldc, size_t m, size_t n, bool add)                                                         \
+                     size_t ldc, size_t m, size_t n, dar_put put)                                                      \
     {                                                                                                                  \
         bool rows = a_k == 1;                                                                                          \
         DAR_ASSERT(ldc < INT32_MAX && a_row < INT32_MAX, "gemm: rows of 2^31 elements are more than OpenBLAS takes");  \
         if (k)                                                                                                         \
             GEMM(CblasRowMajor, rows ? CblasNoTrans : CblasTrans, CblasNoTrans, (int)m, (int)n, (int)k, 1, a,          \
-                 (int)(rows ? a_row : a_k), b, (int)b_k, add, c, (int)ldc);                                            \
-        for (size_t i = 0; !k && !add && i < m; i++) memset((REAL *)c + i * ldc, 0, n * sizeof(REAL));                 \
+                 (int)(rows ? a_row : a_k), b, (int)b_k, put == DAR_PUT_ADD, c, (int)ldc);                             \
+        for (size_t i = 0; !k && put != DAR_PUT_ADD && i < m; i++) memset((REAL *)c + i * ldc, 0, n * sizeof(REAL));   \
     }
 DEF_BLAS(mm_dgemm, double, cblas_dgemm)
 DEF_BLAS(mm_sgemm, float, cblas_sgemm)

@@ -39,7 +39,7 @@ dar_dtype dar_compute_type(dar_dtype storage)
 
 dar_put dar_put_for(size_t bytes, bool add)
 {
-    return add ? DAR_PUT_ADD : bytes > CACHED ? DAR_PUT_STREAM : DAR_PUT;
+    return add ? DAR_PUT_ADD : bytes >= CACHED ? DAR_PUT_STREAM : DAR_PUT;
 }
 
 void dar_row_convert(dar_dtype dst_type, void *dst, dar_dtype src_type, const void *src, size_t n)

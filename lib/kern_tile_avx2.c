@@ -17,6 +17,7 @@ typedef __m256 acc, bvec, avec;
 #define get_c(p, n)      _mm256_maskload_ps(p, first(n))
 #define put_c(p, n, c)   _mm256_maskstore_ps(p, first(n), c)
 #define add_c(c, d)      _mm256_add_ps(c, d)
+#define stream_c(p, c)   _mm256_stream_ps(p, c)
 
 #include "lib/kern_tile.inc"
 

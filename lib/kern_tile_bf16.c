@@ -18,6 +18,7 @@ typedef __m512bh bvec, avec;
 #define get_c(p, n)      _mm512_maskz_loadu_ps(first(n), p)
 #define put_c(p, n, c)   _mm512_mask_storeu_ps(p, first(n), c)
 #define add_c(c, d)      _mm512_add_ps(c, d)
+#define stream_c(p, c)   _mm512_stream_ps(p, c)
 
 #include "lib/kern_tile.inc"
 

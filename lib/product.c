@@ -32,6 +32,7 @@ struct plan {
     const dar_product *p;
     const dar_tile *t;
     bool thin;
+    bool stream;       /* C past the caches, being written once and not read */
     size_t rows, cols; /* stripes of A, of B */
     size_t panel;      /* stripes of B packed at a time */
     size_t tm, tn;     /* tasks along rows, and along the columns of a panel */
@@ -122,6 +123,7 @@ static void cut(struct plan *s, const dar_product *p)
         s->tn = min(s->panel, ceil_div(want, s->tm));
         s->piece = p->direct ? s->panel : min(s->panel, 1 + (ACC_COLS - 1) / t->nr);
     }
+    s->stream = p->direct && !p->done && s->blocks == 1 && dar_put_for(p->m * p->n * elem, p->add) == DAR_PUT_STREAM;
     s->task_rows = ceil_div(s->rows, s->tm);
     s->shared_bytes = align(ceil_div(s->blocks, s->spans) * (s->thin ? s->rows * stripe_a : s->panel * stripe_b));
     s->a_bytes = s->thin || !pack_a ? 0 : align(s->task_rows * stripe_a);
@@ -209,7 +211,8 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
     const dar_operand *a = &block(s, b, &k0, &k)->a;
     const char *as = s->thin ? shared_block(s, b) + w->r0 * stripe_a : w->a;
     const char *bs = s->thin ? w->b : shared_block(s, b) + (w->c0 - s->first) * stripe_b;
-    bool add = b || (s->p->direct && s->p->add), last = b + 1 == s->blocks;
+    dar_put put = b || (s->p->direct && s->p->add) ? DAR_PUT_ADD : s->stream ? DAR_PUT_STREAM : DAR_PUT;
+    bool last = b + 1 == s->blocks;
 
     for (size_t j = w->c0; j < w->c1; j++) {
         const char *pb = bs + (j - w->c0) * stripe_b;
@@ -222,7 +225,7 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
                 pa = (const char *)a->units + (i * t->mr * a->row + k0 / t->unit) * t->unit_bytes;
                 a_row = a->row, a_k = 1;
             }
-            t->mm(dar_tile_units(t, k), pa, a_row, a_k, pb, t->nr, c, ldc, m, n, add);
+            t->mm(dar_tile_units(t, k), pa, a_row, a_k, pb, t->nr, c, ldc, m, n, put);
             if (last && s->p->done) s->p->done(s->p->ctx, i * t->mr, j * t->nr, m, n, c, ldc);
         }
     }

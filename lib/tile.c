@@ -11,7 +11,7 @@
 
 #define DEF_MM(NAME, A, B, C, UNIT)                                                                                    \
     static void NAME(size_t k, const void *a_, size_t a_row, size_t a_k, const void *b_, size_t b_k, void *c_,         \
-                     size_t ldc, size_t m, size_t n, bool add)                                                         \
+                     size_t ldc, size_t m, size_t n, dar_put put)                                                      \
     {                                                                                                                  \
         const A *a = a_;                                                                                               \
         const B *b = b_;                                                                                               \
@@ -22,7 +22,7 @@
                 for (size_t p = 0; p < k; p++)                                                                         \
                     for (size_t u = 0; u < UNIT; u++)                                                                  \
                         s += (C)a[(i * a_row + p * a_k) * UNIT + u] * (C)b[(p * b_k + j) * UNIT + u];                  \
-                c[i * ldc + j] = add ? c[i * ldc + j] + s : s;                                                         \
+                c[i * ldc + j] = put == DAR_PUT_ADD ? c[i * ldc + j] + s : s;                                          \
             }                                                                                                          \
     }
 DEF_MM(mm_f64, double, double, double, 1)

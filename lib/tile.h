@@ -12,7 +12,8 @@
  *   DAR_TILE_I8   u8         s8         i32   quads, exact
  *
  * Order of summation: from zero, k ascending, one accumulator per element of C (bf16: pairs added as the processor
- * does); then, with `add`, that sum to what C holds.  So a result depends on how the caller cuts k and on nothing else.
+ * does); then, if asked to add, that sum to what C holds.  So a result depends on how the caller cuts k and on nothing
+ * else.
  */
 #ifndef DAR_LIB_TILE_H
 #define DAR_LIB_TILE_H
@@ -21,6 +22,7 @@
 #include <stddef.h>
 
 #include "lib/dtype.h"
+#include "lib/kern.h"
 
 typedef enum dar_tile_kind { DAR_TILE_F64, DAR_TILE_F32, DAR_TILE_BF16, DAR_TILE_I8, DAR_TILE_KINDS } dar_tile_kind;
 
@@ -40,12 +42,15 @@ typedef struct dar_tile {
     size_t mr, nr;     /* rows of A, columns of B in a stripe */
 
     /* C[m, n] (+)= A B with m <= mr, n <= nr over k units.
-     *   a: unit (i, k) at a + i * a_row + k * a_k     [units]; the packed stripe has a_row = 1, a_k = mr, and mr rows
-     * are readable; with any other strides rows past m are not read b: unit (k, j) at b + k * b_k + j [units]; nr
-     * columns are readable; the packed stripe has b_k = nr c: element (i, j) at c + i * ldc + j; elements outside [m,
-     * n] are neither read nor written k = 0 clears C unless add. */
+     *
+     *   A: unit (i, k) at a + i * a_row + k * a_k [units].  The packed stripe has a_row = 1, a_k = mr, and mr rows are
+     *      readable; with any other strides rows past m are not read.
+     *   B: unit (k, j) at b + k * b_k + j [units]; nr columns are readable.  The packed stripe has b_k = nr.
+     *   C: element (i, j) at c + i * ldc + j; elements outside [m, n] are neither read nor written.
+     *
+     * k = 0 clears C unless put is to add.  Past the caches go whole tiles whose rows are aligned to 64 bytes. */
     void (*mm)(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c, size_t ldc,
-               size_t m, size_t n, bool add);
+               size_t m, size_t n, dar_put put);
     const dar_packers *pack; /* NULL: by plain loops */
 } dar_tile;
 

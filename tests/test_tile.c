@@ -97,7 +97,8 @@ static double c_at(const dar_tile *t, const void *c, size_t i)
     return t->kind == DAR_TILE_F64 ? ((const double *)c)[i] : (double)((const float *)c)[i];
 }
 
-static double a[MOST * MOST], b[MOST * MOST], c[MOST * MOST], before[MOST * MOST];
+static double a[MOST * MOST], b[MOST * MOST], before[MOST * MOST];
+static _Alignas(64) double c[MOST * MOST];
 
 static void fill_operands(const dar_tile *t)
 {
@@ -118,18 +119,20 @@ static void fill_operands(const dar_tile *t)
     }
 }
 
-/* One product; packed A, or A read where it lies (rows of units + 1). */
-static void check_mm(const dar_tile *t, size_t m, size_t n, size_t k, bool in_place, bool add)
+/* One product; packed A, or A read where it lies (rows of units + 1).  Rows of C are aligned if it is streamed. */
+static void check_mm(const dar_tile *t, size_t m, size_t n, size_t k, bool in_place, dar_put put)
 {
-    size_t units = dar_tile_units(t, k), a_row = in_place ? units + 1 : 1, a_k = in_place ? 1 : t->mr, ldc = n + 3;
+    static const char *const how[] = { "", " add", " stream" };
+    size_t units = dar_tile_units(t, k), a_row = in_place ? units + 1 : 1, a_k = in_place ? 1 : t->mr;
+    size_t ldc = put == DAR_PUT_STREAM ? n / 16 * 16 + 16 : n + 3;
     double eps = t->kind == DAR_TILE_F64 ? DBL_EPSILON : t->kind == DAR_TILE_I8 ? 0 : FLT_EPSILON;
 
     memcpy(c, before, sizeof c);
-    t->mm(units, a, a_row, a_k, b, t->nr, c, ldc, m, n, add);
+    t->mm(units, a, a_row, a_k, b, t->nr, c, ldc, m, n, put);
     for (size_t i = 0; i < (m + 1) * ldc; i++) {
         size_t row = i / ldc, col = i % ldc;
         bool inside = row < m && col < n;
-        double want = inside && !add ? 0 : c_at(t, before, i), size = fabs(want);
+        double want = inside && put != DAR_PUT_ADD ? 0 : c_at(t, before, i), size = fabs(want);
         for (size_t p = 0; inside && p < units * t->unit; p++) {
             size_t at = (row * a_row + p / t->unit * a_k) * t->unit + p % t->unit;
             double x = t->kind == DAR_TILE_I8 ? ((uint8_t *)a)[at] : stored(of_kind[t->kind], a, at);
@@ -139,7 +142,7 @@ static void check_mm(const dar_tile *t, size_t m, size_t n, size_t k, bool in_pl
         }
         double found = c_at(t, c, i), bound = inside ? eps * (double)(k + 8) * size : 0;
         CHECK(fabs(found - want) <= bound, "%s m %zu n %zu k %zu%s%s: C[%zu, %zu] = %g, expected %g", t->name, m, n, k,
-              in_place ? " in place" : "", add ? " add" : "", row, col, found, want);
+              in_place ? " in place" : "", how[put], row, col, found, want);
     }
 }
 
@@ -151,7 +154,7 @@ static void check_products(const dar_tile *t)
     for (size_t i = 0; i < DAR_COUNT(rows); i++)
         for (size_t j = 0; j < DAR_COUNT(cols); j++)
             for (size_t k = 0; k < DAR_COUNT(depths); k++)
-                for (int v = 0; v < 4; v++) check_mm(t, rows[i], cols[j], depths[k], v & 1, v & 2);
+                for (int v = 0; v < 6; v++) check_mm(t, rows[i], cols[j], depths[k], v & 1, (dar_put)(v / 2));
 }
 
 /* Each distinct tile that dar_tile_fit gives for some shape, at every level. */
