@@ -321,6 +321,7 @@ const bench_row bench_op_rows[] = {
     ATTN(1536, 6, 64),
     ATTN(2048, 24, 128),
     ATTN(8192, 24, 128),
+    BOTH(attention, BENCH_F32, BENCH_BF16, 0, 0, 1560, 1, 1024), /* the VAE's, one frame of 480 x 832 */
 
     CONV(conv2d, 384, 384, 5, 8, 14),    /* adapter, small model */
     CONV(conv2d, 3072, 3072, 1, 16, 28), /* adapter */
