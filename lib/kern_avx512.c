@@ -157,15 +157,17 @@ static inline vf v_from_bf16(vh h)
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(h), 16));
 }
 
-/* Not VCVTNEPS2BF16: that one flushes denormals. */
+/* Not VCVTNEPS2BF16: that one flushes denormals.  Half a unit is added, less the last bit where the result is even;
+ * NaN, which that would carry into the sign, is rare enough for a branch. */
 static inline vh v_to_bf16(vf x)
 {
-    __m512i u = _mm512_castps_si512(x), high = _mm512_srli_epi32(u, 16);
-    __m512i odd = _mm512_and_si512(high, _mm512_set1_epi32(1));
-    __m512i r = _mm512_add_epi32(u, _mm512_add_epi32(odd, _mm512_set1_epi32(0x7fff)));
-    __mmask16 nan = _mm512_cmp_ps_mask(x, x, _CMP_UNORD_Q);
-    r = _mm512_srli_epi32(r, 16);
-    return _mm512_cvtepi32_epi16(_mm512_mask_or_epi32(r, nan, high, _mm512_set1_epi32(0x40)));
+    const __m512i high = _mm512_set_epi16(31, 29, 27, 25, 23, 21, 19, 17, 15, 13, 11, 9, 7, 5, 3, 1, 31, 29, 27, 25, 23,
+                                          21, 19, 17, 15, 13, 11, 9, 7, 5, 3, 1);
+    __m512i u = _mm512_castps_si512(x), r = _mm512_add_epi32(u, _mm512_set1_epi32(0x7fff));
+    __mmask16 odd = _mm512_test_epi32_mask(u, _mm512_set1_epi32(0x10000)), nan = _mm512_cmp_ps_mask(x, x, _CMP_UNORD_Q);
+    r = _mm512_mask_sub_epi32(r, odd, r, _mm512_set1_epi32(-1));
+    if (__builtin_expect(nan, 0)) r = _mm512_mask_or_epi32(r, nan, u, _mm512_set1_epi32(0x400000));
+    return _mm512_castsi512_si256(_mm512_permutexvar_epi16(high, r));
 }
 
 static inline vf v_from_f16(vh h)
