@@ -216,10 +216,14 @@ static void blend(const window *w, dar_camera_style style, double time, dar_view
 
 void dar_camera_between(const dar_camera_key *key, size_t keys, dar_camera_style style, double time, dar_view *v)
 {
-    size_t i = 0;
+    size_t i = 0, above = keys; /* key i is at or before `time`, unless it is the first; key `above` is after it */
     window w = { { NULL }, { 0 } };
     DAR_ASSERT(keys >= 1, "camera path without keys");
-    while (i + 1 < keys && key[i + 1].time <= time) i++;
+    while (above - i > 1) {
+        size_t middle = i + (above - i) / 2;
+        if (key[middle].time <= time) i = middle;
+        else above = middle;
+    }
     if (i + 1 == keys || time <= key[i].time) {
         *v = key[i].view;
         return;
