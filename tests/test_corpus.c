@@ -6,6 +6,7 @@
 #include "lib/file.h"
 
 /* LLVMFuzzerTestOneInput of tests/fuzz_json.c and so on, renamed by the Makefile. */
+int fuzz_camera(const uint8_t *data, size_t size);
 int fuzz_gltf(const uint8_t *data, size_t size);
 int fuzz_image(const uint8_t *data, size_t size);
 int fuzz_json(const uint8_t *data, size_t size);
@@ -33,6 +34,12 @@ static void replay(const char *dir, int (*target)(const uint8_t *, size_t))
     }
     closedir(d);
     CHECK(files >= 10, "%s: %d files", dir, files);
+}
+
+static void camera(void **state)
+{
+    (void)state;
+    replay("tests/corpus/camera", fuzz_camera);
 }
 
 static void gltf(void **state)
@@ -67,7 +74,9 @@ static void safetensors(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = { cmocka_unit_test(gltf), cmocka_unit_test(image), cmocka_unit_test(json),
-                                        cmocka_unit_test(obj), cmocka_unit_test(safetensors) };
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(camera), cmocka_unit_test(gltf), cmocka_unit_test(image),
+        cmocka_unit_test(json),   cmocka_unit_test(obj),  cmocka_unit_test(safetensors)
+    };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
