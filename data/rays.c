@@ -8,8 +8,9 @@
 #include "data/rigid.h"
 #include "lib/thread.h"
 
-#define STRIP 256 /* pixels at a time: their rays stay in the nearest cache until they are spread over the channels */
-#define ROWS  16  /* of a picture per task */
+/* A task takes a tile through all frames: as long as the lens stays, the roots and quotients are those of frame 0. */
+#define STRIP 512
+#define ROWS  8
 
 const char *const dar_plucker_name[] = { "wan", "paper", NULL };
 const char *const dar_rays_frame_name[] = { "camera0", "world", NULL };
@@ -51,51 +52,69 @@ static frame frame_of(const double c2w[12], dar_plucker plucker)
     return f;
 }
 
-static void strip(const dar_view *v, const frame *f, size_t j, size_t begin, size_t n,
-                  float y[DAR_RAYS_COMPONENTS][STRIP])
-{
-    double q = ((double)j + 0.5 - v->cy) / v->fy, x[STRIP], scale[STRIP];
-    for (size_t i = 0; i < n; i++) {
-        x[i] = ((double)(int)(begin + i) + 0.5 - v->cx) / v->fx;
-        scale[i] = 1 / sqrt(x[i] * x[i] + (q * q + 1));
-    }
-    for (int c = 0; c < DAR_RAYS_COMPONENTS; c++) {
-        double step = f->step[c], row = f->down[c] * q + f->ahead[c];
-        for (size_t i = 0; i < n; i++) y[c][i] = (float)((step * x[i] + row) * scale[i]);
-    }
-}
-
 typedef struct job {
     const dar_camera_path *path;
     dar_rays_options options;
     double w2c[12]; /* of the frame that rays are in */
     float *y;
-    size_t F, H, W, blocks; /* blocks: tasks per frame */
+    size_t F, H, W, strips; /* strips: tasks per row */
 } job;
 
-static void pack_rows(void *ctx, size_t task, int thread)
-{
-    const job *b = ctx;
-    size_t t = task / b->blocks, begin = task % b->blocks * ROWS, end = begin + ROWS < b->H ? begin + ROWS : b->H;
-    const dar_view *v = &b->path->view[t];
-    float y[DAR_RAYS_COMPONENTS][STRIP];
-    double c2w[12];
-    (void)thread;
+/* What the lens alone decides, for a tile of the picture: rows down, columns right. */
+typedef struct tile {
+    const dar_view *lens; /* whose it is; NULL: nobody's yet */
+    size_t j, i, rows, columns;
+    double x[STRIP], y[ROWS], scale[ROWS][STRIP]; /* scale: 1 / |(x, y, 1)| */
+} tile;
 
-    dar_affine_mul(b->w2c, v->c2w, c2w);
-    if (t == 0 && b->options.frame == DAR_RAYS_CAMERA0) memcpy(c2w, dar_affine_identity, sizeof c2w);
-    frame f = frame_of(c2w, b->options.plucker);
+static void set_lens(tile *s, const dar_view *v)
+{
+    const dar_view *old = s->lens;
+    s->lens = v;
+    if (old && old->fx == v->fx && old->fy == v->fy && old->cx == v->cx && old->cy == v->cy) return;
+    for (size_t i = 0; i < s->columns; i++) s->x[i] = ((double)(int)(s->i + i) + 0.5 - v->cx) / v->fx;
+    for (size_t j = 0; j < s->rows; j++) {
+        double y = s->y[j] = ((double)(s->j + j) + 0.5 - v->cy) / v->fy;
+        for (size_t i = 0; i < s->columns; i++) s->scale[j][i] = 1 / sqrt(s->x[i] * s->x[i] + (y * y + 1));
+    }
+}
+
+/* Frame t of a tile: every component of every row, then on to its channels, of which frame 0 has four each. */
+static void pack_frame(const job *b, const tile *s, size_t t)
+{
+    double c2w[12];
+    float line[STRIP];
     size_t group = (t + DAR_RAYS_GROUP - 1) / DAR_RAYS_GROUP;
     size_t first = t ? (t - 1) % DAR_RAYS_GROUP : 0, last = t ? first : DAR_RAYS_GROUP - 1;
-    for (size_t j = begin; j < end; j++) {
-        for (size_t i = 0; i < b->W; i += STRIP) {
-            size_t n = b->W - i < STRIP ? b->W - i : STRIP;
-            strip(v, &f, j, i, n, y);
-            for (size_t c = 0; c < DAR_RAYS_COMPONENTS; c++)
-                for (size_t k = first; k <= last; k++)
-                    memcpy(b->y + (((c * DAR_RAYS_GROUP + k) * b->F + group) * b->H + j) * b->W + i, y[c],
-                           n * sizeof(float));
+
+    dar_affine_mul(b->w2c, b->path->view[t].c2w, c2w);
+    if (t == 0 && b->options.frame == DAR_RAYS_CAMERA0) memcpy(c2w, dar_affine_identity, sizeof c2w);
+    frame f = frame_of(c2w, b->options.plucker);
+    for (size_t c = 0; c < DAR_RAYS_COMPONENTS; c++) {
+        for (size_t j = 0; j < s->rows; j++) {
+            double step = f.step[c], row = f.down[c] * s->y[j] + f.ahead[c];
+            const double *x = s->x, *scale = s->scale[j];
+            for (size_t i = 0; i < s->columns; i++) line[i] = (float)((step * x[i] + row) * scale[i]);
+            for (size_t k = first; k <= last; k++)
+                memcpy(b->y + (((c * DAR_RAYS_GROUP + k) * b->F + group) * b->H + s->j + j) * b->W + s->i, line,
+                       s->columns * sizeof(float));
         }
+    }
+}
+
+static void pack_tile(void *ctx, size_t task, int thread)
+{
+    const job *b = ctx;
+    tile s;
+    (void)thread;
+    s.lens = NULL;
+    s.j = task / b->strips * ROWS;
+    s.i = task % b->strips * STRIP;
+    s.rows = b->H - s.j < ROWS ? b->H - s.j : ROWS;
+    s.columns = b->W - s.i < STRIP ? b->W - s.i : STRIP;
+    for (size_t t = 0; t < b->path->frames; t++) {
+        set_lens(&s, &b->path->view[t]);
+        pack_frame(b, &s, t);
     }
 }
 
@@ -110,8 +129,8 @@ void dar_rays_pack(const dar_camera_path *p, dar_rays_options options, const dar
                "rays: y is %s, expected [24, %zu, %d, %d] f32", dar_shape_text(&y->shape, found, sizeof found), F,
                v->height, v->width);
     job b = { .path = p, .options = options, .y = y->data, .F = F, .H = (size_t)v->height, .W = (size_t)v->width };
-    b.blocks = (b.H + ROWS - 1) / ROWS;
+    b.strips = (b.W + STRIP - 1) / STRIP;
     memcpy(b.w2c, dar_affine_identity, sizeof b.w2c);
     if (options.frame == DAR_RAYS_CAMERA0) dar_rigid_inverse(v->c2w, b.w2c);
-    dar_parallel(p->frames * b.blocks, pack_rows, &b);
+    dar_parallel((b.H + ROWS - 1) / ROWS * b.strips, pack_tile, &b);
 }
