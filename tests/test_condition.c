@@ -441,6 +441,96 @@ static void frame_of_rays(void **state)
     dar_camera_free(&p);
 }
 
+/* Depth and rays give back the position: a wall seen by frame 0 and by frame 4, both from the tensor. */
+static void back_projection(void **state)
+{
+    (void)state;
+    dar_mark mark = dar_arena_mark(&memory);
+    dar_camera_path p = make_path(T);
+    dar_condition_source s = source_of(&p);
+    dar_condition c = condition_of("world+depth");
+    c.geometry = DAR_GEOMETRY_CAMERA0;
+    clip *x = calloc(1, sizeof *x);
+    x->fail = -1;
+    s.ctx = x;
+    s.center[0] = s.center[1] = s.center[2] = 0;
+    s.box = (dar_box){ { -40, -40, -40 }, { 40, 40, 40 } };
+    s.scale = 80;
+    for (size_t t = 0; t < T; t++) {
+        for (size_t i = 0; i < P; i++) {
+            double o[3], d[3], z = 3 + 0.1 * (double)(i % 29);
+            const double *m = p.view[t].c2w;
+            dar_rays_at(&p.view[t], (double)(i % W) + 0.5, (double)(i / W) + 0.5, o, d);
+            double along = m[2] * d[0] + m[6] * d[1] + m[10] * d[2];
+            x->mask[t][i] = 255;
+            x->depth[t][i] = (float)z;
+            for (int a = 0; a < 3; a++) x->world[t][a][i] = (float)(o[a] + z / along * d[a]);
+        }
+    }
+    const float *y = build_tensor(&c, &s), *rays = y - (size_t)24 * F * P;
+    double world[12], w2c[12], forward[3], place[3];
+    assert_true(dar_condition_world(&c, &s, world, NULL) == DAR_OK);
+    dar_rigid_inverse(p.view[0].c2w, w2c);
+    for (size_t f = 0; f < 2; f++) {
+        double relative[12];
+        dar_affine_mul(w2c, p.view[4 * f].c2w, relative);
+        for (int a = 0; a < 3; a++) forward[a] = relative[4 * a + 2], place[a] = relative[4 * a + 3];
+        for (size_t i = 0; i < P; i++) {
+            double d[3], found[3], depth = 2 + 6 * (double)y[((size_t)3 * F + f) * P + i];
+            for (size_t a = 0; a < 3; a++) d[a] = (double)rays[((12 + 4 * a + 3) * F + f) * P + i];
+            for (int a = 0; a < 3; a++) found[a] = place[a] + depth / dar_vec_dot(forward, d) * d[a];
+            /* To where the tensor says that this surface is; both in camera 0, up to the one scale and shift. */
+            double scale = cbrt(dar_affine_det(world));
+            for (size_t a = 0; a < 3; a++) {
+                double shift = world[4 * a + 3] - 0.5;
+                for (size_t b = 0; b < 3; b++) shift += world[4 * a + b] * p.view[0].c2w[4 * b + 3];
+                CHECK_NEAR("position", scale * found[a] + shift + 0.5, (double)y[(a * F + f) * P + i], 1e-6);
+            }
+        }
+    }
+    free(x);
+    dar_camera_free(&p);
+    dar_arena_reset(&memory, mark);
+}
+
+/* View-z of a point. */
+static double depth_of(const dar_view *v, const double x[3])
+{
+    double w2c[12];
+    dar_rigid_inverse(v->c2w, w2c);
+    return dar_vec_dot(w2c + 8, x) + w2c[11];
+}
+
+/* The paper's proposition 1.  Depth: two points that differ by what is at right angles to the view have the same;
+ * the camera that steps back by a sees the same point a farther.  Tracking and world: equal channels mean the same
+ * element at the same place, whoever looks. */
+static void proposition(void **state)
+{
+    (void)state;
+    dar_camera_path p = make_path(T);
+    dar_condition_source s = source_of(&p);
+    dar_condition c = condition_of("world");
+    double m[12], other[12];
+    for (size_t t = 0; t < T; t++) {
+        dar_view v = p.view[t];
+        const double x[3] = { 1000.25, 1000.5, 1000.75 }, a = 0.625;
+        double beside[3], depth = depth_of(&v, x);
+        for (int i = 0; i < 3; i++) beside[i] = x[i] + 3 * v.c2w[4 * i] - 2 * v.c2w[4 * i + 1];
+        CHECK_NEAR("depth of another point", depth_of(&v, beside), depth, 1e-12);
+        for (int i = 0; i < 3; i++) v.c2w[4 * i + 3] += a * v.c2w[4 * i + 2];
+        CHECK_NEAR("depth of the same point", depth_of(&v, x), depth - a, 1e-12);
+    }
+    assert_true(dar_condition_world(&c, &s, m, NULL) == DAR_OK);
+    CHECK(fabs(dar_affine_det(m)) > 0, "world position is not injective");
+    for (size_t t = 1; t < T; t++) p.view[t].c2w[3] += 1;
+    assert_true(dar_condition_world(&c, &s, other, NULL) == DAR_OK);
+    assert_memory_equal(m, other, sizeof m);
+    p.view[0].c2w[3] += 1; /* in the scene's frame no camera matters */
+    assert_true(dar_condition_world(&c, &s, other, NULL) == DAR_OK);
+    assert_memory_equal(m, other, sizeof m);
+    dar_camera_free(&p);
+}
+
 static void failures(void **state)
 {
     (void)state;
@@ -491,10 +581,10 @@ static void threads(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(by_hand), cmocka_unit_test(packing),       cmocka_unit_test(plucker_identities),
-        cmocka_unit_test(sets),    cmocka_unit_test(keys),          cmocka_unit_test(tensor),
-        cmocka_unit_test(reads),   cmocka_unit_test(frame_of_rays), cmocka_unit_test(failures),
-        cmocka_unit_test(threads),
+        cmocka_unit_test(by_hand),     cmocka_unit_test(packing),       cmocka_unit_test(plucker_identities),
+        cmocka_unit_test(sets),        cmocka_unit_test(keys),          cmocka_unit_test(tensor),
+        cmocka_unit_test(reads),       cmocka_unit_test(frame_of_rays), cmocka_unit_test(back_projection),
+        cmocka_unit_test(proposition), cmocka_unit_test(failures),      cmocka_unit_test(threads),
     };
     made = malloc(sizeof *made);
     make_clip(made);
