@@ -129,6 +129,13 @@ static dar_operand operand_a(const dar_tile *t, const dar_matrix *a, size_t k)
     return (dar_operand){ pack_a, true, a, a->data, ready, a->ld / t->unit };
 }
 
+/* Rows of f32 serve as stripes of B where they lie, if they are whole stripes. */
+static dar_operand operand_b(const dar_tile *t, const dar_matrix *b, size_t n, bool flip)
+{
+    bool ready = t->kind == DAR_TILE_F32 && t->pack && b->type == DAR_F32 && b->t == flip && n % t->nr == 0;
+    return (dar_operand){ flip ? pack_rows_b : pack_b, true, b, b->data, ready, b->ld };
+}
+
 /* ---------------------------------------------------------------- a finished tile */
 
 /* x = alpha x + bias, kept in pre, then y = act(x) into C: one row of n elements from column j on. */
@@ -231,14 +238,14 @@ static void describe(const dar_gemm *g, struct finish *f, dar_product *p)
         *p = (dar_product){ choose_tile(g->kind, g->n, g->m), g->n, g->m, .done = finish_transposed, .ctx = f };
         p->term[0] = (dar_term){ g->k,
                                  { .pack = pack_columns_a, .many = true, .ctx = &g->b },
-                                 { .pack = pack_rows_b, .many = true, .ctx = &g->a } };
+                                 operand_b(p->tile, &g->a, g->m, true) };
         p->term[1] = (dar_term){ g->k2,
                                  { .pack = pack_columns_a, .many = true, .ctx = &g->b2 },
-                                 { .pack = pack_rows_b, .many = true, .ctx = &g->a2 } };
+                                 operand_b(p->tile, &g->a2, g->m, true) };
         return;
     }
-    p->term[0] = (dar_term){ g->k, operand_a(t, &g->a, g->k), { .pack = pack_b, .many = true, .ctx = &g->b } };
-    p->term[1] = (dar_term){ g->k2, operand_a(t, &g->a2, g->k2), { .pack = pack_b, .many = true, .ctx = &g->b2 } };
+    p->term[0] = (dar_term){ g->k, operand_a(t, &g->a, g->k), operand_b(t, &g->b, g->n, false) };
+    p->term[1] = (dar_term){ g->k2, operand_a(t, &g->a2, g->k2), operand_b(t, &g->b2, g->n, false) };
     if (g->type == real && !(g->add && g->alpha != 1)) {
         p->direct = true;
         p->c = g->c;

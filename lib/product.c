@@ -7,7 +7,7 @@
  *   tiles                       along the rows first: the stripe of B is read again and again, A streams past it
  *
  * With few rows (thin) the packing of B outweighs its use by the tiles: each task packs its own piece of B and uses it
- * at once, while A is packed once and shared. */
+ * at once, or reads B where it lies, while A is packed once and shared. */
 #include "lib/product.h"
 
 #include <stdint.h>
@@ -157,7 +157,7 @@ static void pack(const struct plan *s, bool of_a, size_t begin, size_t end, size
     const dar_operand *x = of_a ? &term->a : &term->b;
     size_t step = x->many ? end - begin : 1, bytes = stripe_bytes(s, of_a, b);
 
-    if (!k || x->in_place) return;
+    if (!k || (x->in_place && (of_a || s->thin))) return;
     for (size_t i = begin; i < end; i += step, dst += bytes * step) {
         size_t at = i * wide, last = min(lanes, (i + step) * wide);
         x->pack(x->ctx, s->t, at, last - at, k0, k, dst);
@@ -208,7 +208,8 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
 {
     const dar_tile *t = s->t;
     size_t k0, k, stripe_a = stripe_bytes(s, true, b), stripe_b = stripe_bytes(s, false, b), ldc;
-    const dar_operand *a = &block(s, b, &k0, &k)->a;
+    const dar_term *term = block(s, b, &k0, &k);
+    const dar_operand *in_a = term->a.in_place ? &term->a : NULL, *in_b = s->thin && term->b.in_place ? &term->b : NULL;
     const char *as = s->thin ? shared_block(s, b) + w->r0 * stripe_a : w->a;
     const char *bs = s->thin ? w->b : shared_block(s, b) + (w->c0 - s->first) * stripe_b;
     dar_put put = b || (s->p->direct && s->p->add) ? DAR_PUT_ADD : s->stream ? DAR_PUT_STREAM : DAR_PUT;
@@ -216,16 +217,18 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
 
     for (size_t j = w->c0; j < w->c1; j++) {
         const char *pb = bs + (j - w->c0) * stripe_b;
+        size_t b_k = in_b ? in_b->row : t->nr;
         size_t n = min(s->p->n - j * t->nr, t->nr);
+        if (in_b) pb = (const char *)in_b->units + (k0 / t->unit * b_k + j * t->nr) * t->unit_bytes;
         for (size_t i = w->r0; i < w->r1; i++) {
             const char *pa = as + (i - w->r0) * stripe_a;
             size_t m = min(s->p->m - i * t->mr, t->mr), a_row = 1, a_k = t->mr;
             char *c = sum_at(s, w, i, j, &ldc);
-            if (a->in_place) {
-                pa = (const char *)a->units + (i * t->mr * a->row + k0 / t->unit) * t->unit_bytes;
-                a_row = a->row, a_k = 1;
+            if (in_a) {
+                pa = (const char *)in_a->units + (i * t->mr * in_a->row + k0 / t->unit) * t->unit_bytes;
+                a_row = in_a->row, a_k = 1;
             }
-            t->mm(dar_tile_units(t, k), pa, a_row, a_k, pb, t->nr, c, ldc, m, n, put);
+            t->mm(dar_tile_units(t, k), pa, a_row, a_k, pb, b_k, c, ldc, m, n, put);
             if (last && s->p->done) s->p->done(s->p->ctx, i * t->mr, j * t->nr, m, n, c, ldc);
         }
     }

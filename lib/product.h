@@ -23,8 +23,9 @@ typedef struct dar_operand {
     bool many;
     const void *ctx;
 
-    /* A only: it lies in memory as the tile reads it, unit (i, k) at units + i * row + k [units], and is not packed.
-     * Whole units are read: past k they hold zeros, or B's stripe does. */
+    /* It lies in memory as the tile reads it [units]: of A, unit (i, k) at units + i * row + k; of B, unit (k, j) at
+     * units + k * row + j, in whole stripes.  A is not packed then; B is where many rows of A share it.  Whole units
+     * are read: past k they hold zeros, or the other operand does. */
     const void *units;
     bool in_place;
     size_t row;
