@@ -105,6 +105,10 @@ bench-kernels: deps ## speed of every kernel as a fraction of the machine's peak
 		$B/bench_kernels --output=build/bench/kernels.csv \
 		$(if $(QUICK),--quick) $(if $(FILTER),'--filter=$(FILTER)') $(if $(CPU),--cpu-mask=$(CPU))
 
+$B/speed_%: $B/tests/speed_%.o $B/libdar.a
+	@echo "LD $@"
+	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS) -lcmocka
+
 everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/ulp
 
 headers: $(HDR:%=alone/%)
