@@ -306,7 +306,7 @@ bool dar_raster_at(const dar_raster *r, int x, int y, uint32_t *instance, uint32
 {
     size_t at;
     if (!pixel_of(r, x, y, &at) || !r->in->shown[at]) return false;
-    uint64_t id = r->in->shown[at] - 1;
+    size_t id = (size_t)r->in->shown[at] - 1;
     const dar_raster_piece *p = &r->in->piece[id / DAR_RASTER_PIECE];
     *instance = p->instance;
     *triangle = p->triangle + (uint32_t)(id % DAR_RASTER_PIECE);

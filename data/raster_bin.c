@@ -153,7 +153,6 @@ static uint32_t *cull(const struct job *j, dar_raster_piece *p, size_t t, dar_ra
     const double near = r->view.near;
     double box[4] = { INFINITY, INFINITY, -INFINITY, -INFINITY };
     size_t corner[3];
-    dar_raster_edges e;
     int x0, y0, x1, y1;
 
     dar_raster_corners(r, p->instance, p->triangle + t, corner);
@@ -164,8 +163,9 @@ static uint32_t *cull(const struct job *j, dar_raster_piece *p, size_t t, dar_ra
     centres(box[1], box[3], r->config.height, &y0, &y1);
     if (x1 < 0 || y1 < 0 || x0 >= r->config.width || y0 >= r->config.height) return &p->outside;
     if (x1 < x0 || y1 < y0) return &p->small;
-    if (!dar_raster_edges_of(r, corner, &e)) return &p->edge_on;
-    if (r->config.faces == DAR_FACES_MATERIAL && !p->double_sided && e.back != j->pose->mirrored[p->instance])
+    double side = dar_raster_side(r, corner);
+    if (side == 0) return &p->edge_on;
+    if (r->config.faces == DAR_FACES_MATERIAL && !p->double_sided && (side > 0) != j->pose->mirrored[p->instance])
         return &p->back;
     *b = (dar_raster_box){ (uint16_t)x0, (uint16_t)y0, (uint16_t)x1, (uint16_t)y1 };
     return NULL;

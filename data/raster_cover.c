@@ -14,29 +14,39 @@ static void cross(const double a[3], const double b[3], double y[3])
     y[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* Products are rounded before they are subtracted, so cross(a, b) = -cross(b, a) to the bit: what makes common edges
- * tight.  The plane comes from differences of corners instead: they keep their digits when a triangle is small. */
-bool dar_raster_edges_of(const dar_raster *r, const size_t corner[3], dar_raster_edges *e)
+/* n . v0, and n.  From differences of corners, which keep their digits when a triangle is small. */
+static double plane(double (*cam)[3], const size_t corner[3], double n[3])
 {
-    const double *v[3] = { r->in->cam[corner[0]], r->in->cam[corner[1]], r->in->cam[corner[2]] };
-    double p[3], q[3], n[3];
-
-    for (int c = 0; c < 3; c++) p[c] = v[1][c] - v[0][c], q[c] = v[2][c] - v[0][c];
+    const double *v0 = cam[corner[0]], *v1 = cam[corner[1]], *v2 = cam[corner[2]];
+    double p[3], q[3];
+    for (int c = 0; c < 3; c++) p[c] = v1[c] - v0[c], q[c] = v2[c] - v0[c];
     cross(p, q, n);
-    double det = n[0] * v[0][0] + n[1] * v[0][1] + n[2] * v[0][2], sign = det < 0 ? -1 : 1;
-    if (det == 0) return false;
-    e->back = det > 0;
+    return n[0] * v0[0] + n[1] * v0[1] + n[2] * v0[2];
+}
+
+double dar_raster_side(const dar_raster *r, const size_t corner[3])
+{
+    double n[3];
+    return plane(r->in->cam, corner, n);
+}
+
+/* Products are rounded before they are subtracted, so cross(a, b) = -cross(b, a) to the bit: what makes common edges
+ * tight. */
+void dar_raster_edges_of(const dar_raster *r, const size_t corner[3], dar_raster_edges *e)
+{
+    double n[3], side = plane(r->in->cam, corner, n), sign = side < 0 ? -1 : 1;
+
+    e->back = side > 0;
     for (int k = 0; k < 3; k++) {
         double m[3];
-        cross(v[(k + 1) % 3], v[(k + 2) % 3], m);
+        cross(r->in->cam[corner[(k + 1) % 3]], r->in->cam[corner[(k + 2) % 3]], m);
         e->a[k] = sign * m[0];
         e->b[k] = sign * m[1];
         e->c[k] = sign * m[2];
         /* On the edge itself: the inside lies to the right, or straight below. */
         e->least[k] = e->a[k] > 0 || (e->a[k] == 0 && e->b[k] > 0) ? 0 : DBL_TRUE_MIN;
-        e->w[k] = n[k] / det;
+        e->w[k] = n[k] / side;
     }
-    return true;
 }
 
 /* ---------------------------------------------------------------- rows */
@@ -60,14 +70,14 @@ static void row_at(struct row *r, const dar_raster_edges *e, double dy)
     r->y[3] = e->w[1] * dy + e->w[2];
 }
 
-static void cover_row(const struct row *row, const double *restrict dx, size_t n, uint64_t id, double *restrict nearest,
-                      uint64_t *restrict shown)
+static void cover_row(const struct row *row, const double *restrict dx, size_t n, double id, double *restrict nearest,
+                      double *restrict shown)
 {
     const struct row r = *row;
     for (size_t i = 0; i < n; i++) {
         double e0 = r.x[0] * dx[i] + r.y[0], e1 = r.x[1] * dx[i] + r.y[1], e2 = r.x[2] * dx[i] + r.y[2];
         double w = r.x[3] * dx[i] + r.y[3], old = nearest[i];
-        uint64_t was = shown[i];
+        double was = shown[i];
         bool hit = (e0 >= r.least[0]) & (e1 >= r.least[1]) & (e2 >= r.least[2]) & (w > old) & (w <= r.most);
         nearest[i] = hit ? w : old;
         shown[i] = hit ? id : was;
@@ -102,8 +112,8 @@ static bool there(const struct alpha *a, const double e[3])
     return x[2] * a->material->color[3] * dar_texture_alpha(a->scene, a->material, x[0], x[1]) >= a->cutoff;
 }
 
-static void cover_row_masked(const struct row *r, const struct alpha *a, const double *dx, size_t n, uint64_t id,
-                             double *nearest, uint64_t *shown)
+static void cover_row_masked(const struct row *r, const struct alpha *a, const double *dx, size_t n, double id,
+                             double *nearest, double *shown)
 {
     for (size_t i = 0; i < n; i++) {
         double e[3], w = r->x[3] * dx[i] + r->y[3];
@@ -142,14 +152,15 @@ static void cover_triangle(dar_raster *r, size_t tile, uint32_t id)
     struct alpha a = { 0 };
 
     dar_raster_corners(r, p->instance, t, corner);
-    if (!dar_raster_edges_of(r, corner, &e) || misses(&e, dx, in->dy + y0, n, y1 + 1 - y0)) return;
+    dar_raster_edges_of(r, corner, &e);
+    if (misses(&e, dx, in->dy + y0, n, y1 + 1 - y0)) return;
     struct row row = row_of(&e, r->view.near);
     if (p->masked) a = alpha_of(r, p, t);
     for (size_t y = y0; y <= y1; y++) {
         size_t at = tile * DAR_TILE_PIXELS + (y - top) * DAR_TILE_WIDTH + (x0 - left);
         row_at(&row, &e, in->dy[y]);
-        if (p->masked) cover_row_masked(&row, &a, dx, n, (uint64_t)id + 1, in->nearest + at, in->shown + at);
-        else cover_row(&row, dx, n, (uint64_t)id + 1, in->nearest + at, in->shown + at);
+        if (p->masked) cover_row_masked(&row, &a, dx, n, id + 1.0, in->nearest + at, in->shown + at);
+        else cover_row(&row, dx, n, id + 1.0, in->nearest + at, in->shown + at);
     }
 }
 

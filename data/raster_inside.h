@@ -33,7 +33,7 @@ typedef struct dar_raster_box {
 /* E_k = a_k dx + b_k dy + c_k >= least_k on all three: inside.  1 / depth = w[0] dx + w[1] dy + w[2]. */
 typedef struct dar_raster_edges {
     double a[3], b[3], c[3], least[3], w[3];
-    bool back; /* n points away from the camera */
+    bool back; /* seen from behind, unless mirrored */
 } dar_raster_edges;
 
 struct dar_raster_inside {
@@ -56,7 +56,7 @@ struct dar_raster_inside {
     size_t tiles_x, tiles_y;
     bool *used;              /* [tiles] drawn into in this frame */
     double *nearest;         /* [tiles, DAR_TILE_PIXELS] 1 / depth */
-    uint64_t *shown;         /* [tiles, DAR_TILE_PIXELS] id; as wide as `nearest`: they are selected together */
+    double *shown;           /* [tiles, DAR_TILE_PIXELS] id, exact; f64 so that both are selected by one mask */
     double (*spent)[2];      /* [tiles] seconds of cover and resolve */
     bool drawn, has_normals; /* something; with normals */
 };
@@ -77,7 +77,8 @@ void dar_raster_cull(dar_raster *r, const dar_pose *p);
 size_t dar_raster_bin(dar_raster *r, size_t first); /* from this piece on; returns the first that is left */
 
 /* raster_cover.c: the round's triangles into `nearest` and `shown` of one tile; fresh: it held nothing. */
-bool dar_raster_edges_of(const dar_raster *r, const size_t corner[3], dar_raster_edges *e); /* false: edge-on */
+double dar_raster_side(const dar_raster *r, const size_t corner[3]); /* > 0: seen from behind, 0: edge-on */
+void dar_raster_edges_of(const dar_raster *r, const size_t corner[3], dar_raster_edges *e); /* of one not edge-on */
 void dar_raster_cover(dar_raster *r, size_t tile, bool fresh);
 
 /* raster_resolve.c */

@@ -58,7 +58,7 @@ static void set_colours(const struct job *j, struct surface *s, size_t t)
     dar_identity_cell(d, s->piece->instance, part, s->origin, &s->scale);
 }
 
-static void set_surface(const struct job *j, struct surface *s, uint64_t id)
+static void set_surface(const struct job *j, struct surface *s, size_t id)
 {
     const dar_raster *r = j->r;
     size_t corner[3], t;
@@ -163,17 +163,17 @@ void dar_raster_resolve(const dar_raster *r, const dar_pose *p, const dar_gbuffe
     size_t width = (size_t)r->config.width, height = (size_t)r->config.height;
     size_t left = tile % in->tiles_x * DAR_TILE_WIDTH, top = tile / in->tiles_x * DAR_TILE_HEIGHT;
     size_t n = least(DAR_TILE_WIDTH, width - left), bottom = least(top + DAR_TILE_HEIGHT, height);
-    const uint64_t *shown = in->shown + tile * DAR_TILE_PIXELS;
+    const double *shown = in->shown + tile * DAR_TILE_PIXELS;
     struct job j = { r, p, out };
     struct surface s;
-    uint64_t id = 0;
+    double id = 0;
 
     for (size_t y = top; y < bottom; y++, shown += DAR_TILE_WIDTH) {
         size_t at = y * width + left;
         clear_row(r, out, at, n);
         for (size_t x = 0; x < n; x++) {
             if (!shown[x]) continue;
-            if (shown[x] != id) set_surface(&j, &s, (id = shown[x]) - 1);
+            if (shown[x] != id) set_surface(&j, &s, (size_t)(id = shown[x]) - 1);
             resolve_pixel(&j, &s, in->dx[left + x], in->dy[y], at + x);
         }
     }
