@@ -75,7 +75,7 @@ int main(int argc, char **argv)
     printf("%s, %d x %d, %d frames, %d threads\n", path, width, height, frames, dar_threads());
     double full = clip(&s, animation, width, height, frames, 0.6);
     clip(&s, animation, width, height, frames, 1.3);
-    double empty = clip(&s, animation, width, height, frames, 4.5);
+    double empty = clip(&s, animation, width, height, frames, 2.7);
     printf("nearly empty / full: %.2f\n", empty / full);
     dar_scene_free(&s);
     return 0;

@@ -73,6 +73,21 @@ static void parts(void **state)
     const uint32_t *sheet = d.identity.mesh[2].part;
     assert_true(sheet[0] == 0 && sheet[1] == 0 && sheet[2] == 1 && sheet[3] == 1);
     draw_free(&s, &d);
+
+    /* Corners apart at equal places, 0 and -0 among them, hang together; a third triangle lies elsewhere. */
+    static const float corner[9][3] = { { 0, 0, 0 },     { 1, 0, 0 }, { 0, 1, 0 }, { 1, -0.0f, 0 }, { 1, 1, 0 },
+                                        { -0.0f, 1, 0 }, { 3, 0, 0 }, { 4, 0, 0 }, { 3, 1, 0 } };
+    made_init(&s);
+    dar_mesh *m = made_mesh(&s, 9, 3, DAR_NONE);
+    memcpy(m->position, corner, sizeof corner);
+    for (uint32_t i = 0; i < 9; i++) m->index[i] = i;
+    made_instance(&s, 0, NULL);
+    dar_raster_config c = dar_raster_default(WIDTH, HEIGHT);
+    drawn_init(&d, &s, &c);
+    const uint32_t *part = d.identity.mesh[0].part;
+    assert_int_equal(d.identity.parts, 2);
+    assert_true(part[0] == 0 && part[1] == 0 && part[2] == 1);
+    draw_free(&s, &d);
 }
 
 struct sample {

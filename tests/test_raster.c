@@ -191,13 +191,23 @@ static void build_tiny(dar_scene *s) /* triangles of a tenth of a pixel */
     made_instance(s, 0, NULL);
 }
 
-static void build_mirrored(dar_scene *s) /* one mesh, right and left, and one more inside out by its index */
+static void add_mirrored(dar_scene *s, bool double_sided) /* one mesh, right and left */
 {
     const double right[12] = { 0.8, 0, 0, 1.1, 0, 0.8, 0.2, 0, 0, 0, 0.8, 0 };
     const double left[12] = { -0.8, 0, 0, -1.1, 0, 0.8, 0.2, 0, 0, 0, 0.8, 0 };
-    made_sheet(s, 14, 18, true, made_torus, made_material(s, false));
+    made_sheet(s, 14, 18, true, made_torus, made_material(s, double_sided));
     made_instance(s, 0, right);
     made_instance(s, 0, left);
+}
+
+static void build_mirrored(dar_scene *s)
+{
+    add_mirrored(s, false);
+}
+
+static void build_mirrored_double(dar_scene *s)
+{
+    add_mirrored(s, true);
 }
 
 static void build_degenerate(dar_scene *s) /* points, needles, doubles, no normals */
@@ -290,6 +300,12 @@ static const struct {
     { "tiny triangles", build_tiny, { 1, 1, 4 }, { 0, 0, 0 }, DAR_FACES_MATERIAL, 800 },
     { "mirrored", build_mirrored, { 0.5, 2, 4 }, { 0, 0, 0 }, DAR_FACES_MATERIAL, 700 },
     { "mirrored, all faces", build_mirrored, { 0.9, 0.3, 1.2 }, { -1, 0, 0 }, DAR_FACES_ALL, 1000 },
+    { "mirrored, double-sided, within",
+      build_mirrored_double,
+      { -2, 0.25, 0 },
+      { 1, 0, 0.3 },
+      DAR_FACES_MATERIAL,
+      1000 },
     { "degenerate", build_degenerate, { 0.5, 0.7, 2.5 }, { 0, 0, 0 }, DAR_FACES_MATERIAL, 50 },
     { "skin", build_skin, { 1.5, 1, 3 }, { 0, 0, 0 }, DAR_FACES_MATERIAL, 500 },
     { "morph", build_morph, { 1.5, 1, 3 }, { 0, 0, 0 }, DAR_FACES_MATERIAL, 700 },
