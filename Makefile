@@ -88,7 +88,7 @@ test: deps ## install what is missing, build, run every test; the last line coun
 
 # Two tests want the real models that may lie beside the repository.
 test-built: $(TESTS:%=$B/%)
-	@EXPECTED_SKIPS=$(if $(wildcard ../shared/assets/robot.glb),0,2) scripts/run-tests.sh $B $(TESTS)
+	@EXPECTED_SKIPS=$(if $(wildcard ../shared/assets/robot.glb),0,3) scripts/run-tests.sh $B $(TESTS)
 
 $B/bench_kernels: $(BENCH) $B/tests/net.o
 $B/ulp: $B/tests/ulp.o
@@ -109,7 +109,7 @@ $B/speed_%: $B/tests/speed_%.o $B/libdar.a
 	@echo "LD $@"
 	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS) -lcmocka
 
-everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/ulp
+everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/speed_raster $B/ulp
 
 headers: $(HDR:%=alone/%)
 
