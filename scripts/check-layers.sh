@@ -36,7 +36,7 @@ BEGIN {
 
     standard = "^(complex|ctype|errno|fenv|float|inttypes|limits|locale|math|setjmp|signal|stdalign|stdarg|" \
         "stdatomic|stdbool|stddef|stdint|stdio|stdlib|string|time|wchar|" \
-        "dirent|fcntl|pthread|sched|strings|unistd|sys/[a-z]+)[.]h$"
+        "dirent|fcntl|pthread|sched|spawn|strings|unistd|sys/[a-z]+)[.]h$"
 }
 
 FNR == 1 {

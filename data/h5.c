@@ -1,0 +1,398 @@
+/* h5.c: the only user of HDF5. */
+#include "data/h5.h"
+
+#include <hdf5.h>
+#include <inttypes.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "lib/file.h"
+
+#define DEFLATE_LEVEL 1
+
+struct dar_h5 {
+    hid_t id; /* negative: closed */
+    bool writing;
+    dar_file_out out;
+    char path[PATH_MAX];
+};
+
+static const struct type {
+    const char *name;
+    size_t size;
+} types[DAR_H5_TYPES] = {
+    [DAR_H5_U8] = { "u8", 1 },   [DAR_H5_U16] = { "u16", 2 }, [DAR_H5_I16] = { "i16", 2 },
+    [DAR_H5_U32] = { "u32", 4 }, [DAR_H5_F32] = { "f32", 4 },
+};
+
+size_t dar_h5_type_size(dar_h5_type type)
+{
+    DAR_ASSERT((unsigned)type < DAR_H5_TYPES, "h5: type %d", (int)type);
+    return types[type].size;
+}
+
+static hid_t stored_type(dar_h5_type type)
+{
+    switch (type) {
+    case DAR_H5_U8: return H5T_STD_U8LE;
+    case DAR_H5_U16: return H5T_STD_U16LE;
+    case DAR_H5_I16: return H5T_STD_I16LE;
+    case DAR_H5_U32: return H5T_STD_U32LE;
+    default: return H5T_IEEE_F32LE;
+    }
+}
+
+/* ---------------------------------------------------------------- errors */
+
+/* HDF5 keeps this per thread, so every entry says it again. */
+static void silence(void)
+{
+    H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
+    H5Eclear2(H5E_DEFAULT);
+}
+
+/* The innermost entry of HDF5's stack is the cause. */
+static herr_t first_cause(unsigned n, const H5E_error2_t *x, void *to)
+{
+    if (n == 0) snprintf(to, 160, "%s", x->desc ? x->desc : "no reason given");
+    return 0;
+}
+
+static dar_status refused(const dar_h5 *f, const char *name, const char *what, dar_err *e)
+{
+    char why[160] = "no reason given";
+    H5Ewalk2(H5E_DEFAULT, H5E_WALK_UPWARD, first_cause, why);
+    return dar_fail(e, f->writing ? DAR_ERR_IO : DAR_ERR_FORMAT, "%s: %s%s%s: HDF5: %s", f->path, name,
+                    *name ? ": " : "", what, why);
+}
+
+/* ---------------------------------------------------------------- files */
+
+static dar_status allocate(dar_h5 **out, const char *path, bool writing, dar_err *e)
+{
+    dar_h5 *f = calloc(1, sizeof *f);
+    *out = f;
+    if (!f) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
+    f->id = H5I_INVALID_HID;
+    f->writing = writing;
+    snprintf(f->path, sizeof f->path, "%s", path);
+    silence();
+    return DAR_OK;
+}
+
+static dar_status finish_open(dar_h5 **out, dar_status s)
+{
+    if (s == DAR_OK) return s;
+    dar_h5_close(*out);
+    *out = NULL;
+    return s;
+}
+
+/* HDF5 writes to the temporary file by name; out.fd, open on the same file, flushes it at the end. */
+dar_status dar_h5_create(dar_h5 **out, const char *path, dar_err *e)
+{
+    dar_status s = allocate(out, path, true, e);
+    if (s == DAR_OK) s = dar_file_create(&(*out)->out, path, e);
+    if (s == DAR_OK) {
+        (*out)->id = H5Fcreate((*out)->out.temp, H5F_ACC_TRUNC, H5P_DEFAULT, H5P_DEFAULT);
+        if ((*out)->id < 0) s = refused(*out, "", "cannot create", e);
+    }
+    return finish_open(out, s);
+}
+
+dar_status dar_h5_commit(dar_h5 *f, dar_err *e)
+{
+    DAR_ASSERT(f->writing && f->id >= 0, "%s: not open for writing", f->path);
+    silence();
+    bool closed = H5Fclose(f->id) >= 0;
+    f->id = H5I_INVALID_HID;
+    if (!closed) return refused(f, "", "cannot finish", e);
+    return dar_file_commit(&f->out, e);
+}
+
+dar_status dar_h5_open(dar_h5 **out, const char *path, dar_err *e)
+{
+    dar_file_map m;
+    *out = NULL;
+    DAR_TRY(dar_file_map_open(&m, path, e)); /* says clearly that there is no such file */
+    dar_file_map_close(&m);
+
+    dar_status s = allocate(out, path, false, e);
+    if (s == DAR_OK) {
+        (*out)->id = H5Fopen(path, H5F_ACC_RDONLY, H5P_DEFAULT);
+        if ((*out)->id < 0) s = refused(*out, "", "cannot open", e);
+    }
+    return finish_open(out, s);
+}
+
+void dar_h5_close(dar_h5 *f)
+{
+    if (!f) return;
+    silence();
+    if (f->id >= 0) H5Fclose(f->id);
+    dar_file_discard(&f->out);
+    free(f);
+}
+
+/* ---------------------------------------------------------------- arrays */
+
+static void check_array(const char *name, const dar_h5_array *a)
+{
+    DAR_ASSERT((unsigned)a->type < DAR_H5_TYPES && a->rank >= 1 && a->rank <= DAR_H5_RANK, "%s: type %d, rank %d", name,
+               (int)a->type, a->rank);
+}
+
+/* Space of `count` leading indices. */
+static hid_t space_of(const dar_h5_array *a, uint64_t count)
+{
+    hsize_t n[DAR_H5_RANK];
+    for (int i = 0; i < a->rank; i++) n[i] = i ? a->dim[i] : count;
+    return H5Screate_simple(a->rank, n, NULL);
+}
+
+static hid_t creation(const dar_h5_array *a)
+{
+    hsize_t chunk[DAR_H5_RANK];
+    uint64_t lead = a->chunk ? a->chunk : 1;
+    for (int i = 0; i < a->rank; i++) chunk[i] = i ? a->dim[i] : lead < a->dim[0] ? lead : a->dim[0];
+
+    hid_t p = H5Pcreate(H5P_DATASET_CREATE);
+    static const unsigned char zero[8];
+    bool done = p >= 0 && H5Pset_chunk(p, a->rank, chunk) >= 0 && H5Pset_shuffle(p) >= 0 &&
+                H5Pset_deflate(p, DEFLATE_LEVEL) >= 0 && H5Pset_fill_value(p, stored_type(a->type), zero) >= 0 &&
+                H5Pset_obj_track_times(p, false) >= 0; /* the same content gives the same bytes */
+    if (!done && p >= 0) H5Pclose(p);
+    return done ? p : H5I_INVALID_HID;
+}
+
+dar_status dar_h5_make(dar_h5 *f, const char *name, const dar_h5_array *a, dar_err *e)
+{
+    check_array(name, a);
+    for (int i = 0; i < a->rank; i++) DAR_ASSERT(a->dim[i] > 0, "%s: dimension %d is 0", name, i);
+    silence();
+    hid_t space = space_of(a, a->dim[0]), p = creation(a), links = H5Pcreate(H5P_LINK_CREATE), set = H5I_INVALID_HID;
+    if (space >= 0 && p >= 0 && links >= 0 && H5Pset_create_intermediate_group(links, 1) >= 0)
+        set = H5Dcreate2(f->id, name, stored_type(a->type), space, links, p, H5P_DEFAULT);
+    dar_status s = set < 0 ? refused(f, name, "cannot make", e) : DAR_OK;
+    if (set >= 0) H5Dclose(set);
+    if (links >= 0) H5Pclose(links);
+    if (p >= 0) H5Pclose(p);
+    if (space >= 0) H5Sclose(space);
+    return s;
+}
+
+/* Every group on the way must be there before HDF5 can be asked for the last one. */
+bool dar_h5_has(dar_h5 *f, const char *name)
+{
+    char part[256];
+    silence();
+    for (const char *p = name;; p++) {
+        if (*p && *p != '/') continue;
+        int n = snprintf(part, sizeof part, "%.*s", (int)(p - name), name);
+        if (n >= (int)sizeof part || H5Lexists(f->id, part, H5P_DEFAULT) <= 0) return false;
+        if (!*p) return true;
+    }
+}
+
+/* Another file's data, or code loaded for a filter, must not come in through this one. */
+static bool plain_storage(hid_t p, uint64_t *chunk_bytes, size_t size)
+{
+    H5D_layout_t layout = H5Pget_layout(p);
+    hsize_t chunk[DAR_H5_RANK];
+    *chunk_bytes = 0;
+    if (layout == H5D_CHUNKED) {
+        int rank = H5Pget_chunk(p, DAR_H5_RANK, chunk);
+        if (rank < 1 || rank > DAR_H5_RANK) return false;
+        *chunk_bytes = size;
+        for (int i = 0; i < rank; i++)
+            if (__builtin_mul_overflow(*chunk_bytes, chunk[i], chunk_bytes)) return false;
+    } else if (layout != H5D_CONTIGUOUS && layout != H5D_COMPACT) {
+        return false;
+    }
+    int filters = H5Pget_nfilters(p);
+    for (int i = 0; i < filters; i++) {
+        unsigned flags, config;
+        size_t none = 0;
+        H5Z_filter_t x = H5Pget_filter2(p, (unsigned)i, &flags, &none, NULL, 0, NULL, &config);
+        if (x != H5Z_FILTER_DEFLATE && x != H5Z_FILTER_SHUFFLE && x != H5Z_FILTER_FLETCHER32) return false;
+    }
+    return filters >= 0 && H5Pget_external_count(p) == 0;
+}
+
+static const char *describe(char *to, size_t size, const char *type, int rank, const hsize_t *dim)
+{
+    int n = snprintf(to, size, "%s[", type);
+    for (int i = 0; i < rank && n < (int)size; i++)
+        n += dim[i] ? snprintf(to + n, size - (size_t)n, "%s%" PRIuHSIZE, i ? "," : "", dim[i])
+                    : snprintf(to + n, size - (size_t)n, "%sany", i ? "," : "");
+    if (n < (int)size) snprintf(to + n, size - (size_t)n, "]");
+    return to;
+}
+
+static dar_status compare(const dar_h5 *f, const char *name, dar_h5_array *a, hid_t type, hid_t space, dar_err *e)
+{
+    char found[160], expected[160];
+    hsize_t dim[H5S_MAX_RANK], wanted[DAR_H5_RANK];
+    const char *found_type = "another type";
+    int rank = H5Sget_simple_extent_ndims(space);
+    if (rank < 0 || H5Sget_simple_extent_dims(space, dim, NULL) < 0) return refused(f, name, "cannot read sizes", e);
+    bool same = rank == a->rank && H5Tequal(type, stored_type(a->type)) > 0;
+    for (int i = 0; i < DAR_H5_TYPES; i++)
+        if (H5Tequal(type, stored_type((dar_h5_type)i)) > 0) found_type = types[i].name;
+    for (int i = 0; i < rank && same; i++) same = dim[i] > 0 && (!a->dim[i] || dim[i] == a->dim[i]);
+    for (int i = 0; i < a->rank; i++) wanted[i] = a->dim[i];
+    if (!same)
+        return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found %s, expected %s", f->path, name,
+                        describe(found, sizeof found, found_type, rank, dim),
+                        describe(expected, sizeof expected, types[a->type].name, a->rank, wanted));
+    uint64_t bytes = types[a->type].size;
+    for (int i = 0; i < rank; i++)
+        if (__builtin_mul_overflow(bytes, dim[i], &bytes) || bytes > SIZE_MAX / 2)
+            return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found %s, which no memory holds", f->path, name,
+                            describe(found, sizeof found, found_type, rank, dim));
+    for (int i = 0; i < rank; i++) a->dim[i] = dim[i];
+    return DAR_OK;
+}
+
+dar_status dar_h5_expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *e)
+{
+    dar_status s = DAR_OK;
+    uint64_t chunk;
+    check_array(name, a);
+    silence();
+    if (!dar_h5_has(f, name)) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found nothing of this name", f->path, name);
+    hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT);
+    if (set < 0) return refused(f, name, "cannot open", e);
+    hid_t type = H5Dget_type(set), space = H5Dget_space(set), p = H5Dget_create_plist(set);
+
+    if (type < 0 || space < 0 || p < 0) {
+        s = refused(f, name, "cannot read the header", e);
+    } else if (!plain_storage(p, &chunk, types[a->type].size)) {
+        s = dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found another file's data or an unknown filter, expected deflate",
+                     f->path, name);
+    } else if ((s = compare(f, name, a, type, space, e)) == DAR_OK && chunk > DAR_H5_CHUNK_MAX) {
+        s = dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found chunks of %" PRIu64 " bytes, expected at most %" PRIu64, f->path,
+                     name, chunk, DAR_H5_CHUNK_MAX);
+    }
+    if (p >= 0) H5Pclose(p);
+    if (space >= 0) H5Sclose(space);
+    if (type >= 0) H5Tclose(type);
+    H5Dclose(set);
+    return s;
+}
+
+/* One of `to` and `from` is NULL. */
+static dar_status transfer(dar_h5 *f, const char *name, const dar_h5_array *a, uint64_t first, uint64_t count, void *to,
+                           const void *from, dar_err *e)
+{
+    hsize_t start[DAR_H5_RANK] = { first }, n[DAR_H5_RANK];
+    check_array(name, a);
+    DAR_ASSERT(count > 0 && first < a->dim[0] && count <= a->dim[0] - first,
+               "%s: %" PRIu64 " from %" PRIu64 " of %" PRIu64, name, count, first, a->dim[0]);
+    for (int i = 0; i < a->rank; i++) n[i] = i ? a->dim[i] : count;
+    silence();
+    hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT), memory = space_of(a, count),
+          space = set < 0 ? set : H5Dget_space(set);
+    herr_t done = -1;
+    if (memory >= 0 && space >= 0 && H5Sselect_hyperslab(space, H5S_SELECT_SET, start, NULL, n, NULL) >= 0)
+        done = to ? H5Dread(set, stored_type(a->type), memory, space, H5P_DEFAULT, to)
+                  : H5Dwrite(set, stored_type(a->type), memory, space, H5P_DEFAULT, from);
+    dar_status s = done < 0 ? refused(f, name, to ? "cannot read" : "cannot write", e) : DAR_OK;
+    if (space >= 0) H5Sclose(space);
+    if (memory >= 0) H5Sclose(memory);
+    if (set >= 0) H5Dclose(set);
+    return s;
+}
+
+dar_status dar_h5_write(dar_h5 *f, const char *name, const dar_h5_array *a, uint64_t first, uint64_t count,
+                        const void *data, dar_err *e)
+{
+    return transfer(f, name, a, first, count, NULL, data, e);
+}
+
+dar_status dar_h5_read(dar_h5 *f, const char *name, const dar_h5_array *a, uint64_t first, uint64_t count, void *data,
+                       dar_err *e)
+{
+    return transfer(f, name, a, first, count, data, NULL, e);
+}
+
+/* ---------------------------------------------------------------- attributes */
+
+static dar_status put(dar_h5 *f, const char *name, const char *key, hid_t type, hid_t space, const void *data,
+                      dar_err *e)
+{
+    silence();
+    hid_t a = H5Acreate_by_name(f->id, name, key, type, space, H5P_DEFAULT, H5P_DEFAULT, H5P_DEFAULT);
+    dar_status s = a < 0 || H5Awrite(a, type, data) < 0 ? refused(f, name, key, e) : DAR_OK;
+    if (a >= 0) H5Aclose(a);
+    H5Sclose(space);
+    return s;
+}
+
+dar_status dar_h5_put_numbers(dar_h5 *f, const char *name, const char *key, const double *x, size_t n, dar_err *e)
+{
+    hsize_t dim = n;
+    return put(f, name, key, H5T_IEEE_F64LE, n == 1 ? H5Screate(H5S_SCALAR) : H5Screate_simple(1, &dim, NULL), x, e);
+}
+
+static hid_t text_type(size_t size)
+{
+    hid_t type = H5Tcopy(H5T_C_S1);
+    H5Tset_size(type, size);
+    H5Tset_cset(type, H5T_CSET_UTF8);
+    return type;
+}
+
+dar_status dar_h5_put_text(dar_h5 *f, const char *name, const char *key, const char *text, dar_err *e)
+{
+    hid_t type = text_type(strlen(text) + 1);
+    dar_status s = put(f, name, key, type, H5Screate(H5S_SCALAR), text, e);
+    H5Tclose(type);
+    return s;
+}
+
+/* Open an attribute of n elements of a class. */
+static dar_status get(hid_t *a, dar_h5 *f, const char *name, const char *key, H5T_class_t class, size_t n, dar_err *e)
+{
+    silence();
+    *a = H5Aopen_by_name(f->id, name, key, H5P_DEFAULT, H5P_DEFAULT);
+    if (*a < 0) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: attribute %s is missing", f->path, name, key);
+    hid_t type = H5Aget_type(*a), space = H5Aget_space(*a);
+    bool fits =
+        type >= 0 && space >= 0 && H5Tget_class(type) == class && H5Sget_simple_extent_npoints(space) == (hssize_t)n;
+    if (class == H5T_STRING && fits) fits = H5Tis_variable_str(type) == 0;
+    if (type >= 0) H5Tclose(type);
+    if (space >= 0) H5Sclose(space);
+    if (fits) return DAR_OK;
+    H5Aclose(*a);
+    return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: attribute %s: expected %zu %s", f->path, name, key, n,
+                    class == H5T_STRING ? "text of a fixed length" : "numbers");
+}
+
+dar_status dar_h5_get_numbers(dar_h5 *f, const char *name, const char *key, double *x, size_t n, dar_err *e)
+{
+    hid_t a;
+    DAR_TRY(get(&a, f, name, key, H5T_FLOAT, n, e));
+    dar_status s = H5Aread(a, H5T_NATIVE_DOUBLE, x) < 0 ? refused(f, name, key, e) : DAR_OK;
+    H5Aclose(a);
+    return s;
+}
+
+dar_status dar_h5_get_text(dar_h5 *f, const char *name, const char *key, char *text, size_t size, dar_err *e)
+{
+    hid_t a;
+    DAR_TRY(get(&a, f, name, key, H5T_STRING, 1, e));
+    dar_status s = DAR_OK;
+    if (H5Aget_storage_size(a) > size) {
+        s = dar_fail(e, DAR_ERR_FORMAT, "%s: %s: attribute %s: text of %" PRIuHSIZE " bytes, expected at most %zu",
+                     f->path, name, key, H5Aget_storage_size(a), size);
+    } else {
+        hid_t type = text_type(size);
+        if (H5Aread(a, type, text) < 0) s = refused(f, name, key, e);
+        else text[size - 1] = 0;
+        H5Tclose(type);
+    }
+    H5Aclose(a);
+    return s;
+}
