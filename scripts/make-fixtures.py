@@ -118,6 +118,7 @@ def corpus():
     })
 
     put("gltf", gltf_files())
+    put("exr", exr_files())
     put("obj", obj_files())
     put("image", image_files())
 
@@ -215,6 +216,79 @@ def obj_files():
         "zero": square + b"f 0 1 2\n",
         "numbers": b"v 1e300 nan 0x10\nv -.5e-3 +7. 123456789012345678901234567890\n",
         "pattern": b"f_%04d*?.obj\0f_0012xy.obj",
+    }
+
+
+def exr_files():
+    """OpenEXR written by hand; the pixels are 1, 2, 3 ... in every channel that has any."""
+    import struct
+
+    def attr(name, kind, value):
+        return f"{name}\0{kind}\0".encode() + struct.pack("<I", len(value)) + value
+
+    def header(data, display, channels, compression, more):
+        """`data` and `display`: x0 y0 x1 y1, both ends included; a channel: name, pixel type, sampling."""
+        listed = b"".join(n.encode() + b"\0" + struct.pack("<iB3xii", t, 0, k, k) for n, t, k in channels) + b"\0"
+        return (
+            attr("channels", "chlist", listed) + attr("compression", "compression", bytes([compression]))
+            + attr("dataWindow", "box2i", struct.pack("<4i", *data))
+            + attr("displayWindow", "box2i", struct.pack("<4i", *display))
+            + attr("lineOrder", "lineOrder", b"\0") + attr("pixelAspectRatio", "float", struct.pack("<f", 1))
+            + attr("screenWindowCenter", "v2f", bytes(8)) + attr("screenWindowWidth", "float", struct.pack("<f", 1))
+            + more + b"\0"
+        )
+
+    def rows(data, start, number):
+        """Chunks of one row of one float channel; `number`: of the part, or nothing."""
+        x0, y0, x1, y1 = data
+        w = x1 - x0 + 1
+        return [
+            number + struct.pack("<2i", y, 4 * w) + struct.pack(f"<{w}f", *range(start + i * w, start + i * w + w))
+            for i, y in enumerate(range(y0, y1 + 1))
+        ]
+
+    def table(chunks, at):
+        offsets = b""
+        at += 8 * len(chunks)
+        for c in chunks:
+            offsets += struct.pack("<Q", at)
+            at += len(c)
+        return offsets
+
+    def file(data, display, channels=(("Z", 2, 1),), compression=0, more=b"", flags=0, pixels=True):
+        head = struct.pack("<II", 20000630, 2 | flags) + header(data, display, channels, compression, more)
+        chunks = rows(data, 1, b"") if pixels else []
+        return head + table(chunks, len(head)) + b"".join(chunks)
+
+    def several(data, names):
+        head = struct.pack("<II", 20000630, 2 | 0x1000)
+        for channel, part in names:
+            more = attr("name", "string", part) + attr("type", "string", b"scanlineimage")
+            more += attr("chunkCount", "int", struct.pack("<i", data[3] - data[1] + 1))
+            head += header(data, data, [(channel, 2, 1)], 0, more)
+        chunks = [c for i in range(len(names)) for c in rows(data, 1 + 100 * i, struct.pack("<i", i))]
+        head += b"\0"
+        return head + table(chunks, len(head)) + b"".join(chunks)
+
+    small = (0, 0, 2, 1)
+    plain = file(small, small)
+    tiles = attr("tiles", "tiledesc", struct.pack("<IIB", 2, 2, 0))
+    return {
+        "empty": b"",
+        "plain": plain,
+        "window": file((1, 1, 3, 2), (0, 0, 4, 3)),
+        "negative": file((-3, -2, -1, -1), (-3, -2, -1, -1)),
+        "parts": several(small, [("Depth.Z", b"left"), ("Normal.X", b"right")]),
+        "outside": file((0, 0, 3, 1), small),
+        "huge": file((0, 0, 2**31 - 2, 2**31 - 2), (0, 0, 2**31 - 2, 2**31 - 2), pixels=False),
+        "dwaa": file(small, small, compression=8),
+        "dwab": file(small, small, compression=9),
+        "zip": file(small, small, compression=3),
+        "subsampled": file((0, 0, 3, 1), (0, 0, 3, 1), [("Z", 2, 2)]),
+        "many": file(small, small, [(f"L{i:02}.X", i % 3, 1) for i in range(40)]),
+        "tiled": file(small, small, more=tiles, flags=0x200, pixels=False) + bytes(64),
+        "cut": plain[:-5],
+        "cut_header": plain[:60],
     }
 
 

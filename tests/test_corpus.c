@@ -7,6 +7,7 @@
 
 /* LLVMFuzzerTestOneInput of tests/fuzz_json.c and so on, renamed by the Makefile. */
 int fuzz_camera(const uint8_t *data, size_t size);
+int fuzz_exr(const uint8_t *data, size_t size);
 int fuzz_gltf(const uint8_t *data, size_t size);
 int fuzz_image(const uint8_t *data, size_t size);
 int fuzz_json(const uint8_t *data, size_t size);
@@ -42,6 +43,12 @@ static void camera(void **state)
     replay("tests/corpus/camera", fuzz_camera);
 }
 
+static void exr(void **state)
+{
+    (void)state;
+    replay("tests/corpus/exr", fuzz_exr);
+}
+
 static void gltf(void **state)
 {
     (void)state;
@@ -74,9 +81,8 @@ static void safetensors(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = {
-        cmocka_unit_test(camera), cmocka_unit_test(gltf), cmocka_unit_test(image),
-        cmocka_unit_test(json),   cmocka_unit_test(obj),  cmocka_unit_test(safetensors)
-    };
+    const struct CMUnitTest tests[] = { cmocka_unit_test(camera),     cmocka_unit_test(exr),  cmocka_unit_test(gltf),
+                                        cmocka_unit_test(image),      cmocka_unit_test(json), cmocka_unit_test(obj),
+                                        cmocka_unit_test(safetensors) };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
