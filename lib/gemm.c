@@ -32,8 +32,8 @@ DEF_BLAS(mm_sgemm, float, cblas_sgemm)
 #define BLAS_ROWS 48
 #define BLAS_COLS 96
 
-static const dar_tile blas_f64 = { "f64 openblas", DAR_TILE_F64, 1, 8, BLAS_ROWS, BLAS_COLS, mm_dgemm, NULL };
-static const dar_tile blas_f32 = { "f32 openblas", DAR_TILE_F32, 1, 4, BLAS_ROWS, BLAS_COLS, mm_sgemm, NULL };
+static const dar_tile blas_f64 = { "f64 openblas", DAR_TILE_F64, 1, 8, BLAS_ROWS, BLAS_COLS, mm_dgemm, NULL, NULL };
+static const dar_tile blas_f32 = { "f32 openblas", DAR_TILE_F32, 1, 4, BLAS_ROWS, BLAS_COLS, mm_sgemm, NULL, NULL };
 
 static const dar_tile *choose_tile(dar_tile_kind kind, size_t m, size_t n)
 {
@@ -132,7 +132,7 @@ static dar_operand operand_a(const dar_tile *t, const dar_matrix *a, size_t k)
 /* Rows of f32 serve as stripes of B where they lie, if they are whole stripes. */
 static dar_operand operand_b(const dar_tile *t, const dar_matrix *b, size_t n, bool flip)
 {
-    bool ready = t->kind == DAR_TILE_F32 && t->pack && b->type == DAR_F32 && b->t == flip && n % t->nr == 0;
+    bool ready = t->mm_beside && b->type == DAR_F32 && b->t == flip && n % t->nr == 0;
     return (dar_operand){ flip ? pack_rows_b : pack_b, true, b, b->data, ready, b->ld };
 }
 

@@ -93,9 +93,9 @@ static const dar_packers pack = {
 };
 
 static const dar_tile of[] = {
-    { "bf16 6x64 avx512", DAR_TILE_BF16, 2, 4, 6, 64, mm_6x64, &pack },
-    { "bf16 8x48 avx512", DAR_TILE_BF16, 2, 4, 8, 48, mm_8x48, &pack },
-    { "bf16 12x32 avx512", DAR_TILE_BF16, 2, 4, 12, 32, mm_12x32, &pack },
-    { "bf16 12x16 avx512", DAR_TILE_BF16, 2, 4, 12, 16, mm_12x16, &pack },
+    { "bf16 6x64 avx512", DAR_TILE_BF16, 2, 4, 6, 64, mm_6x64, &pack, NULL },
+    { "bf16 8x48 avx512", DAR_TILE_BF16, 2, 4, 8, 48, mm_8x48, &pack, NULL },
+    { "bf16 12x32 avx512", DAR_TILE_BF16, 2, 4, 12, 32, mm_12x32, &pack, NULL },
+    { "bf16 12x16 avx512", DAR_TILE_BF16, 2, 4, 12, 16, mm_12x16, &pack, NULL },
 };
 const dar_tile_set dar_tiles_bf16 = { of, 4 };

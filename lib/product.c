@@ -228,7 +228,7 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
                 pa = (const char *)in_a->units + (i * t->mr * in_a->row + k0 / t->unit) * t->unit_bytes;
                 a_row = in_a->row, a_k = 1;
             }
-            t->mm(dar_tile_units(t, k), pa, a_row, a_k, pb, b_k, c, ldc, m, n, put);
+            (in_b ? t->mm_beside : t->mm)(dar_tile_units(t, k), pa, a_row, a_k, pb, b_k, c, ldc, m, n, put);
             if (last && s->p->done) s->p->done(s->p->ctx, i * t->mr, j * t->nr, m, n, c, ldc);
         }
     }

@@ -24,8 +24,8 @@ typedef struct dar_operand {
     const void *ctx;
 
     /* It lies in memory as the tile reads it [units]: of A, unit (i, k) at units + i * row + k; of B, unit (k, j) at
-     * units + k * row + j, in whole stripes.  A is not packed then; B is where many rows of A share it.  Whole units
-     * are read: past k they hold zeros, or the other operand does. */
+     * units + k * row + j, in whole stripes, and the tile has mm_beside.  A is not packed then; B is where many rows of
+     * A share it.  Whole units are read: past k they hold zeros, or the other operand does. */
     const void *units;
     bool in_place;
     size_t row;

@@ -30,9 +30,9 @@ DEF_MM(mm_f32, float, float, float, 1)
 DEF_MM(mm_i8, uint8_t, int8_t, int32_t, 4)
 
 static const dar_tile ref[] = {
-    { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64, NULL },
-    { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32, NULL },
-    { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8, NULL },
+    { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64, NULL, NULL },
+    { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32, NULL, NULL },
+    { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8, NULL, NULL },
 };
 
 /* ---------------------------------------------------------------- the table */

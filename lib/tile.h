@@ -34,6 +34,9 @@ typedef struct dar_packers {
     dar_pack_fn *across[DAR_DTYPES]; /* the lanes of one k consecutive */
 } dar_packers;
 
+typedef void dar_mm_fn(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c,
+                       size_t ldc, size_t m, size_t n, dar_put put);
+
 typedef struct dar_tile {
     const char *name; /* "f32 6x64 avx512" */
     dar_tile_kind kind;
@@ -49,9 +52,12 @@ typedef struct dar_tile {
      *   C: element (i, j) at c + i * ldc + j; elements outside [m, n] are neither read nor written.
      *
      * k = 0 clears C unless put is to add.  Past the caches go whole tiles whose rows are aligned to 64 bytes. */
-    void (*mm)(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c, size_t ldc,
-               size_t m, size_t n, dar_put put);
+    dar_mm_fn *mm;
     const dar_packers *pack; /* NULL: by plain loops */
+
+    /* The same where B's next stripe lies beside this one, at b + nr: asks for it meanwhile, since pieces a row apart
+     * are nothing that the hardware foresees.  NULL: there is none. */
+    dar_mm_fn *mm_beside;
 } dar_tile;
 
 /* The kind that multiplies operands stored as t fastest here: f64 -> F64; bf16 -> BF16 where the processor has it, else
