@@ -96,6 +96,14 @@ static void pack_b(const void *ctx, const dar_tile *t, size_t at, size_t n, size
     pack(x, t, false, x->t, at, n, k0, k, dst);
 }
 
+/* A's rows, only converted. */
+static void pack_rows_a(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *dst)
+{
+    const dar_matrix *x = ctx;
+    const char *from = (const char *)x->data + (at * x->ld + k0) * dar_dtype_size(x->type);
+    dar_tile_pack_a_rows(t, x->type, from, x->ld, n, k, dst);
+}
+
 /* W, stored [n, k] in 8 bits, for an 8-bit tile. */
 static void pack_w(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *dst)
 {
@@ -126,14 +134,23 @@ static bool lies_ready(const dar_tile *t, const dar_matrix *a, size_t k)
 static dar_operand operand_a(const dar_tile *t, const dar_matrix *a, size_t k)
 {
     bool ready = lies_ready(t, a, k);
-    return (dar_operand){ pack_a, true, a, a->data, ready, a->ld / t->unit };
+    bool rows = !a->t && dar_tile_takes_rows(t, a->type);
+    return (dar_operand){ .pack = rows ? pack_rows_a : pack_a,
+                          .many = true,
+                          .by_row = rows,
+                          .ctx = a,
+                          .units = a->data,
+                          .in_place = ready,
+                          .row = a->ld / t->unit };
 }
 
 /* Rows of f32 serve as stripes of B where they lie, if they are whole stripes. */
 static dar_operand operand_b(const dar_tile *t, const dar_matrix *b, size_t n, bool flip)
 {
     bool ready = t->mm_beside && b->type == DAR_F32 && b->t == flip && n % t->nr == 0;
-    return (dar_operand){ flip ? pack_rows_b : pack_b, true, b, b->data, ready, b->ld };
+    return (dar_operand){
+        .pack = flip ? pack_rows_b : pack_b, .many = true, .ctx = b, .units = b->data, .in_place = ready, .row = b->ld
+    };
 }
 
 /* ---------------------------------------------------------------- a finished tile */

@@ -53,6 +53,23 @@ static inline units along_bf16(const void *p, size_t n)
 ALONG(along_f32, 4, get_f32)
 ALONG(along_f16, 2, get_f16)
 
+/* Rows stay rows. */
+#define ROWS(NAME, SIZE, ALONG)                                                                                        \
+    static void NAME(const void *src, size_t ld, size_t lanes, size_t k, size_t wide, void *dst)                       \
+    {                                                                                                                  \
+        size_t row = (k + UNIT - 1) / UNIT;                                                                            \
+        (void)wide;                                                                                                    \
+        for (size_t i = 0; i < lanes; i++) {                                                                           \
+            const char *from = (const char *)src + i * ld * SIZE;                                                      \
+            int32_t *to = (int32_t *)dst + i * row;                                                                    \
+            size_t p = 0;                                                                                              \
+            for (; p + W * UNIT <= k; p += W * UNIT) put_units(to + p / UNIT, W, ALONG(from + p * SIZE, W * UNIT));    \
+            if (p < k) put_units(to + p / UNIT, row - p / UNIT, ALONG(from + p * SIZE, k - p));                        \
+        }                                                                                                              \
+    }
+ROWS(f32_rows, 4, along_f32)
+ROWS(f16_rows, 2, along_f16)
+
 /* Rows k and k + 1 (or one alone) interleaved. */
 static inline units pairs(__m256i low, __m256i high)
 {
@@ -90,6 +107,7 @@ PACK(f16, 2, along_f16, across_f16)
 static const dar_packers pack = {
     .along = { [DAR_F32] = f32_along, [DAR_BF16] = bf16_along, [DAR_F16] = f16_along },
     .across = { [DAR_F32] = f32_across, [DAR_BF16] = bf16_across, [DAR_F16] = f16_across },
+    .rows = { [DAR_F32] = f32_rows, [DAR_F16] = f16_rows },
 };
 
 static const dar_tile of[] = {

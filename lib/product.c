@@ -104,7 +104,8 @@ static void cut(struct plan *s, const dar_product *p)
     size_t stripe_a = s->depth * t->mr * t->unit_bytes, stripe_b = s->depth * t->nr * t->unit_bytes;
     size_t elem = t->kind == DAR_TILE_F64 ? 8 : 4;
     bool pack_a = (p->term[0].k && !p->term[0].a.in_place) || (p->term[1].k && !p->term[1].a.in_place);
-    size_t task_rows = p->direct ? TASK_ROWS : TASK_ROWS_APART;
+    bool apart = !p->direct && s->blocks > 1; /* else a finished tile leaves its scratch at once */
+    size_t task_rows = apart ? TASK_ROWS_APART : TASK_ROWS;
     size_t want = threads * (s->thin ? 2 : pack_a ? 1 : 8); /* tasks: many even out, few pack less often */
 
     if (s->thin) {
@@ -121,14 +122,14 @@ static void cut(struct plan *s, const dar_product *p)
         s->tm = ceil_div(p->m, task_rows);
         if (s->tm > threads) s->tm = min(s->rows, ceil_div(s->tm, threads) * threads);
         s->tn = min(s->panel, ceil_div(want, s->tm));
-        s->piece = p->direct ? s->panel : min(s->panel, 1 + (ACC_COLS - 1) / t->nr);
+        s->piece = apart ? min(s->panel, 1 + (ACC_COLS - 1) / t->nr) : s->panel;
     }
     s->stream = p->direct && !p->done && s->blocks == 1 && dar_put_for(p->m * p->n * elem, p->add) == DAR_PUT_STREAM;
     s->task_rows = ceil_div(s->rows, s->tm);
     s->shared_bytes = align(ceil_div(s->blocks, s->spans) * (s->thin ? s->rows * stripe_a : s->panel * stripe_b));
     s->a_bytes = s->thin || !pack_a ? 0 : align(s->task_rows * stripe_a);
     s->b_bytes = s->thin ? align(s->piece * stripe_b) : 0;
-    s->c_bytes = p->direct ? 0 : align(s->task_rows * t->mr * s->piece * t->nr * elem);
+    s->c_bytes = p->direct ? 0 : align((apart ? s->task_rows * s->piece : 1) * t->mr * t->nr * elem);
 }
 
 size_t dar_product_scratch(const dar_product *p)
@@ -199,6 +200,10 @@ struct task {
 static char *sum_at(const struct plan *s, const struct task *w, size_t i, size_t j, size_t *ldc)
 {
     size_t elem = s->t->kind == DAR_TILE_F64 ? 8 : 4, row = i * s->t->mr, col = j * s->t->nr;
+    if (!s->p->direct && s->blocks == 1) {
+        *ldc = s->t->nr;
+        return w->c;
+    }
     *ldc = s->p->direct ? s->p->ldc : s->piece * s->t->nr;
     if (!s->p->direct) row -= w->r0 * s->t->mr, col -= w->c0 * s->t->nr;
     return (s->p->direct ? (char *)s->p->c : w->c) + (row * *ldc + col) * elem;
@@ -227,6 +232,8 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
             if (in_a) {
                 pa = (const char *)in_a->units + (i * t->mr * in_a->row + k0 / t->unit) * t->unit_bytes;
                 a_row = in_a->row, a_k = 1;
+            } else if (term->a.by_row) {
+                a_row = dar_tile_units(t, k), a_k = 1;
             }
             (in_b ? t->mm_beside : t->mm)(dar_tile_units(t, k), pa, a_row, a_k, pb, b_k, c, ldc, m, n, put);
             if (last && s->p->done) s->p->done(s->p->ctx, i * t->mr, j * t->nr, m, n, c, ldc);

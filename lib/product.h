@@ -21,6 +21,7 @@ typedef struct dar_operand {
      * multiple of the width, k0 of the unit.  Runs on any thread; each lane of B is asked for once per block of k. */
     void (*pack)(const void *ctx, const dar_tile *t, size_t at, size_t n, size_t k0, size_t k, void *stripes);
     bool many;
+    bool by_row; /* A only: each row of a stripe lies by itself, its units consecutive */
     const void *ctx;
 
     /* It lies in memory as the tile reads it [units]: of A, unit (i, k) at units + i * row + k; of B, unit (k, j) at

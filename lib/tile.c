@@ -173,3 +173,14 @@ void dar_tile_pack_b_nk(const dar_tile *t, dar_dtype src_type, const void *src, 
 {
     pack(t, true, src_type, src, ld, n, k, t->nr, dst);
 }
+
+bool dar_tile_takes_rows(const dar_tile *t, dar_dtype src_type)
+{
+    return t->pack && t->pack->rows[src_type];
+}
+
+void dar_tile_pack_a_rows(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
+                          void *dst)
+{
+    t->pack->rows[src_type](src, ld, m, k, t->mr, dst);
+}

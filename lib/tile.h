@@ -32,6 +32,7 @@ typedef void dar_pack_fn(const void *src, size_t ld, size_t lanes, size_t k, siz
 typedef struct dar_packers {
     dar_pack_fn *along[DAR_DTYPES];  /* by stored type, a lane's elements consecutive; NULL: by plain loops */
     dar_pack_fn *across[DAR_DTYPES]; /* the lanes of one k consecutive */
+    dar_pack_fn *rows[DAR_DTYPES];   /* from and to lanes that lie along k; NULL: not to be had */
 } dar_packers;
 
 typedef void dar_mm_fn(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c,
@@ -91,6 +92,12 @@ void dar_tile_pack_b_nk(const dar_tile *t, dar_dtype src_type, const void *src, 
 /* As b_kn, into stripes of `wide` columns: mm reads such a stripe from any column with b_k = wide. */
 void dar_tile_pack_b_wide(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t k, size_t n,
                           size_t wide, void *dst);
+
+/* Rows of A, src[m][k], converted but left rows, each filled up to whole units with zeros: for dar_tile.mm with a_row =
+ * dar_tile_units(k) and a_k = 1.  Cheaper than stripes where there is a conversion for it. */
+bool dar_tile_takes_rows(const dar_tile *t, dar_dtype src_type);
+void dar_tile_pack_a_rows(const dar_tile *t, dar_dtype src_type, const void *src, size_t ld, size_t m, size_t k,
+                          void *dst);
 
 /* Fill the table for a set of DAR_CPU_ flags; called by dar_cpu_init. */
 void dar_tile_init(unsigned cpu_flags);
