@@ -201,10 +201,15 @@ static void fetch_rows(const struct finish *f, size_t i, size_t j, size_t m, siz
             __builtin_prefetch((const void *)(c + r * f->ldc * size + at), 1);
 }
 
+static bool stores_only(const struct finish *f)
+{
+    return f->alpha == 1 && !f->bias && !f->pre && !f->act && !f->add;
+}
+
 static void finish_tile(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
 {
     const struct finish *f = ctx;
-    bool plain = f->alpha == 1 && !f->bias && !f->pre && !f->act && !f->add;
+    bool plain = stores_only(f);
     size_t size = dar_dtype_size(f->type), row = ldc * dar_dtype_size(f->real);
     char *x = c, *y = (char *)f->c + (i * f->ldc + j) * size;
     if (f->type != f->real) fetch_rows(f, i + m, j, m, n);
@@ -305,7 +310,7 @@ struct i8 {
     size_t row;      /* k in whole units */
     float *scale;    /* [m] */
     int32_t *offset; /* [n]: 128 sum w */
-    void (*scale_sums)(size_t n, const int32_t *sum, const int32_t *offset, float a, const float *b, void *y);
+    void (*const *scale_sums)(size_t m, size_t n, const dar_sums *s, void *y, size_t ldy);
     dar_matrix a, b;
 };
 
@@ -338,13 +343,15 @@ static void sum_rows(void *ctx, size_t begin, size_t end, int thread)
 static void finish_i8(const void *ctx, size_t i, size_t j, size_t m, size_t n, void *c, size_t ldc)
 {
     const struct i8 *s = ctx;
-    const int32_t *offset = s->offset + j;
-    const float *w_scale = s->g->w_scale + j;
-    for (size_t r = 0; r < m; r++) {
-        int32_t *sum = (int32_t *)c + r * ldc;
-        s->scale_sums(n, sum, offset, s->scale[i + r], w_scale, sum);
+    dar_sums sums = { c, ldc, s->offset + j, s->scale + i, s->g->w_scale + j };
+    char *y = (char *)s->f.c + (i * s->f.ldc + j) * dar_dtype_size(s->f.type);
+    if (stores_only(&s->f)) {
+        fetch_rows(&s->f, i + m, j, m, n);
+        s->scale_sums[s->f.type](m, n, &sums, y, s->f.ldc);
+    } else {
+        s->scale_sums[DAR_F32](m, n, &sums, c, ldc);
+        finish_tile(&s->f, i, j, m, n, c, ldc);
     }
-    finish_tile(&s->f, i, j, m, n, c, ldc);
 }
 
 /* Returns the bytes of scratch in front of the product's own. */

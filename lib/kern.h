@@ -40,6 +40,14 @@ typedef struct dar_adamw {
     double rate, beta1, beta2, eps, decay, fix1, fix2, scale;
 } dar_adamw;
 
+/* A tile of sums of 8-bit products, rows ld apart, with the scales of its rows and columns. */
+typedef struct dar_sums {
+    const int32_t *sum;
+    size_t ld;
+    const int32_t *offset;
+    const float *a, *b;
+} dar_sums;
+
 /* Pointers are to rows of the table's type unless said, and need no alignment.  An output may be the same row as an
  * input, never one that overlaps it otherwise. */
 typedef void dar_kern_map(size_t n, const void *x, void *y);
@@ -99,8 +107,8 @@ typedef struct dar_kern {
     void (*quantise)(size_t n, const void *x, float scale, int8_t *q);
     void (*dequantise)(size_t n, const int8_t *q, float scale, void *x);
 
-    /* y = (sum - offset) (a b): sums of 8-bit products times the scales of their row and columns. */
-    void (*scale_sums)(size_t n, const int32_t *sum, const int32_t *offset, float a, const float *b, void *y);
+    /* By stored type, f64 and i8 NULL: y[i][j] = (sum[i][j] - offset[j]) (a[i] b[j]), rows ldy apart, j < n. */
+    void (*scale_sums[DAR_DTYPES])(size_t m, size_t n, const dar_sums *s, void *y, size_t ldy);
 } dar_kern;
 
 /* The table for arithmetic in t: DAR_F32 or DAR_F64. */

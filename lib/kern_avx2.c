@@ -192,7 +192,7 @@ static inline vf v_difference(const int32_t *a, const int32_t *b)
         _mm256_sub_epi32(_mm256_loadu_si256((const void *)a), _mm256_loadu_si256((const void *)b)));
 }
 
-/* Whole numbers in [-127, 127]. */
+/* Numbers in [-127, 127], to the nearest. */
 static inline void v_to_i8(int8_t *p, vf x)
 {
     __m256i i = _mm256_cvtps_epi32(x);

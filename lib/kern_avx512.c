@@ -191,7 +191,7 @@ static inline vf v_difference(const int32_t *a, const int32_t *b)
     return _mm512_cvtepi32_ps(_mm512_sub_epi32(_mm512_loadu_si512(a), _mm512_loadu_si512(b)));
 }
 
-/* Whole numbers in [-127, 127]. */
+/* Numbers in [-127, 127], to the nearest. */
 static inline void v_to_i8(int8_t *p, vf x)
 {
     _mm_storeu_si128((void *)p, _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(x)));

@@ -11,7 +11,7 @@
     SLOT(gelu_tanh_back) SLOT(relu_back) SLOT(add) SLOT(mul) SLOT(offset) SLOT(scale) SLOT(axpy) \
     SLOT(mul_add) SLOT(sum) SLOT(sum_sq) SLOT(dot) SLOT(max) SLOT(max_abs) SLOT(nonfinite) SLOT(exp_sum) \
     SLOT(softmax_back) SLOT(norm) SLOT(norm_sums) SLOT(norm_back) SLOT(rope) SLOT(adamw) SLOT(quantise) \
-    SLOT(dequantise) SLOT(scale_sums)
+    SLOT(dequantise)
 /* clang-format on */
 
 void dar_kern_ref_f32(dar_kern *k); /* fills every slot */
