@@ -6,6 +6,8 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "lib/file.h"
+
 /* What libpng's callbacks need; the message is kept because the jump loses it. */
 struct source {
     const unsigned char *data;
@@ -95,4 +97,72 @@ dar_status dar_png_decode(const dar_image *im, const char *name, const void *dat
     DAR_TRY(read_png(&again, NULL, name, data, size, e));
     DAR_ASSERT(again.width == im->width && again.height == im->height && im->rgba, "%s: not the picture probed", name);
     return read_png(&again, im->rgba, name, data, size, e);
+}
+
+/* ---------------------------------------------------------------- writing */
+
+struct sink {
+    dar_file_out out;
+    dar_err *e;
+    dar_status s; /* of the file */
+    char why[128];
+};
+
+static void put(png_structp png, png_bytep data, size_t n)
+{
+    struct sink *k = png_get_io_ptr(png);
+    k->s = dar_file_write(&k->out, data, n, k->e);
+    if (k->s != DAR_OK) png_error(png, "cannot write");
+}
+
+static void flush(png_structp png)
+{
+    (void)png;
+}
+
+static void write_failed(png_structp png, png_const_charp why)
+{
+    struct sink *k = png_get_error_ptr(png);
+    snprintf(k->why, sizeof k->why, "%s", why);
+    png_longjmp(png, 1);
+}
+
+static void encode_rows(png_structp png, png_infop info, size_t width, size_t height, int channels, const uint8_t *data)
+{
+    int color = channels == 1 ? PNG_COLOR_TYPE_GRAY : channels == 3 ? PNG_COLOR_TYPE_RGB : PNG_COLOR_TYPE_RGB_ALPHA;
+    png_set_user_limits(png, DAR_IMAGE_MAX_SIDE, DAR_IMAGE_MAX_SIDE);
+    png_set_IHDR(png, info, (png_uint_32)width, (png_uint_32)height, 8, color, PNG_INTERLACE_NONE,
+                 PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
+    png_set_sRGB(png, info, PNG_sRGB_INTENT_PERCEPTUAL);
+    png_write_info(png, info);
+    for (size_t y = 0; y < height; y++) png_write_row(png, data + y * width * (size_t)channels);
+    png_write_end(png, NULL);
+}
+
+static void encode(struct sink *k, size_t width, size_t height, int channels, const uint8_t *data)
+{
+    png_structp png = png_create_write_struct(PNG_LIBPNG_VER_STRING, k, write_failed, warned);
+    png_infop info = png ? png_create_info_struct(png) : NULL;
+    if (!info) {
+        k->s = dar_fail(k->e, DAR_ERR_NOMEM, "%s: out of memory", k->out.path);
+    } else if (setjmp(png_jmpbuf(png))) {
+        if (k->s == DAR_OK) k->s = dar_fail(k->e, DAR_ERR_IO, "%s: PNG: %s", k->out.path, k->why);
+    } else {
+        png_set_write_fn(png, k, put, flush);
+        encode_rows(png, info, width, height, channels, data);
+    }
+    png_destroy_write_struct(&png, &info);
+}
+
+dar_status dar_png_write(const char *path, size_t width, size_t height, int channels, const uint8_t *data, dar_err *e)
+{
+    struct sink k = { .e = e };
+    DAR_ASSERT(width && height && width <= DAR_IMAGE_MAX_SIDE && height <= DAR_IMAGE_MAX_SIDE &&
+                   (channels == 1 || channels == 3 || channels == 4),
+               "%s: %zux%zu, %d channels", path, width, height, channels);
+    k.s = dar_file_create(&k.out, path, e);
+    if (k.s == DAR_OK) encode(&k, width, height, channels, data);
+    if (k.s == DAR_OK) k.s = dar_file_commit(&k.out, e);
+    dar_file_discard(&k.out);
+    return k.s;
 }

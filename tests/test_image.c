@@ -1,7 +1,11 @@
 /* test_image.c: pictures for base colours, whole and damaged. */
 #include "tests/test.h"
 
+#include <unistd.h>
+
 #include "data/image.h"
+#include "data/png.h"
+#include "lib/file.h"
 
 /* Left half (254, 0, 0), right half (0, 0, 254), 16 x 8, quality 100, no subsampling. */
 static const unsigned char jpeg[] = {
@@ -108,6 +112,34 @@ static void jpeg_colors(void **state)
     }
 }
 
+static void written(void **state)
+{
+    (void)state;
+    char path[] = "/tmp/dar-png-XXXXXX";
+    uint8_t data[7 * 5 * 4], rgba[7 * 5 * 4];
+    dar_image im;
+    dar_err e;
+    dar_file_map m;
+    int fd = mkstemp(path);
+    assert_true(fd >= 0);
+    close(fd);
+    for (size_t i = 0; i < sizeof data; i++) data[i] = (uint8_t)(37 * i + 5);
+    for (int n = 1; n <= 4; n += n == 1 ? 2 : 1) {
+        CHECK(dar_png_write(path, 7, 5, n, data, &e) == DAR_OK, "%s", e.text);
+        CHECK(dar_file_map_open(&m, path, &e) == DAR_OK, "%s", e.text);
+        CHECK(decode(m.data, m.size, &im, rgba, sizeof rgba, &e) == DAR_OK, "%s", e.text);
+        CHECK(im.width == 7 && im.height == 5, "%zu x %zu", im.width, im.height);
+        for (int i = 0; i < 35 * 4; i++) {
+            int c = i % 4, want = c == 3 && n < 4 ? 255 : data[i / 4 * n + (n == 1 ? 0 : c)];
+            CHECK(rgba[i] == want, "%d channels, byte %d: found %d, expected %d", n, i, rgba[i], want);
+        }
+        dar_file_map_close(&m);
+    }
+    unlink(path);
+    CHECK(dar_png_write("/nowhere/x.png", 7, 5, 3, data, &e) == DAR_ERR_IO && strstr(e.text, "/nowhere/x.png"), "%s",
+          e.text);
+}
+
 static void damaged(void **state)
 {
     (void)state;
@@ -142,6 +174,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(whole),
         cmocka_unit_test(jpeg_colors),
+        cmocka_unit_test(written),
         cmocka_unit_test(damaged),
     };
     return cmocka_run_group_tests_name("image", tests, NULL, NULL) != 0;
