@@ -3,6 +3,7 @@
 
     safetensors    reference.safetensors   pip install torch==2.13.0 safetensors numpy
     torch_rng      torch_rng.json          pip install torch==2.13.0 numpy; on a processor with AVX2
+    solvers        solvers.json            pip install torch==2.13.0 diffusers==0.42.1
     corpus         ../corpus/              nothing
 
 Run from the root of the tree.  The tests need none of this: the files are committed.
@@ -60,6 +61,36 @@ def torch_rng():
     with open("tests/fixtures/torch_rng.json", "w") as f:
         f.write(f"// torch {torch.__version__}: scripts/make-fixtures.py torch_rng\n")
         f.write(json.dumps(out, separators=(",", ":")).replace('{"dtype"', '\n{"dtype"') + "\n")
+
+
+def solvers():
+    """The public schedulers in f64: states before and after every step, for velocities that are tanh(2 z) + sigma."""
+    import json
+
+    import torch
+    from diffusers import DPMSolverMultistepScheduler, FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler
+
+    flow = dict(use_flow_sigmas=True, prediction_type="flow_prediction", flow_shift=5.0)
+    made = {
+        "euler": FlowMatchEulerDiscreteScheduler(shift=5.0),
+        "unipc": UniPCMultistepScheduler(**flow),
+        "dpm++": DPMSolverMultistepScheduler(**flow),
+    }
+    out = []
+    for name, scheduler in made.items():
+        for steps in (1, 2, 5, 9):
+            scheduler.set_timesteps(steps)
+            if name == "dpm++":  # the full range, that its first step leaves from sigma = 1
+                scheduler.sigmas[0] = 1
+            scheduler.sigmas = sigma = scheduler.sigmas.double()
+            z = torch.linspace(-2, 2, 7, dtype=torch.float64)[None, None]
+            states = [z.flatten().tolist()]
+            for i, t in enumerate(scheduler.timesteps):
+                z = scheduler.step(torch.tanh(2 * z) + sigma[i], t, z, return_dict=False)[0]
+                states.append(z.flatten().tolist())
+            out.append({"solver": name, "sigma": sigma.tolist(), "states": states})
+    with open("tests/fixtures/solvers.json", "w") as f:
+        json.dump(out, f, indent=0)
 
 
 def corpus():
@@ -333,7 +364,7 @@ def image_files():
 
 
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (safetensors, torch_rng, corpus)}
+    known = {f.__name__: f for f in (safetensors, torch_rng, solvers, corpus)}
     if not sys.argv[1:] or any(name not in known for name in sys.argv[1:]):
         sys.exit(__doc__)
     for name in sys.argv[1:]:
