@@ -314,20 +314,27 @@ struct i8 {
     dar_matrix a, b;
 };
 
+#define GROUP 4 /* rows quantised together */
+
+/* Scales first: the reduction of a row to one number is a long chain, which the next rows hide. */
 static void quantise_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct i8 *s = ctx;
-    size_t k = s->g->k;
+    const dar_gemm_i8 *g = s->g;
+    size_t row = g->lda * dar_dtype_size(g->a_type);
     (void)thread;
-    for (size_t i = begin; i < end; i++) {
-        const char *x = (const char *)s->g->a + i * s->g->lda * dar_dtype_size(s->g->a_type);
-        uint8_t *q = s->q + i * s->row;
-        s->scale[i] = dar_row_quantise(s->g->a_type, x, k, (int8_t *)q);
-        for (size_t j = 0; j < k; j++) q[j] ^= 128;
-        memset(q + k, 0, s->row - k);
+    for (size_t at = begin; at < end; at += GROUP) {
+        size_t stop = end - at < GROUP ? end : at + GROUP;
+        for (size_t i = at; i < stop; i++) s->scale[i] = dar_row_scale(g->a_type, (const char *)g->a + i * row, g->k);
+        for (size_t i = at; i < stop; i++) {
+            uint8_t *q = s->q + i * s->row;
+            dar_kern_for(DAR_F32)->quantise[g->a_type](g->k, (const char *)g->a + i * row, s->scale[i], 128, q);
+            memset(q + g->k, 0, s->row - g->k);
+        }
     }
 }
 
+/* 256 bytes sum to 16 bits, eight or more at a time. */
 static void sum_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct i8 *s = ctx;
@@ -335,7 +342,12 @@ static void sum_rows(void *ctx, size_t begin, size_t end, int thread)
     for (size_t j = begin; j < end; j++) {
         const int8_t *w = s->g->w + j * s->g->k;
         int32_t sum = 0;
-        for (size_t p = 0; p < s->g->k; p++) sum += w[p];
+        for (size_t p = 0; p < s->g->k; p += 256) {
+            size_t n = s->g->k - p < 256 ? s->g->k - p : 256;
+            int16_t part = 0;
+            for (size_t q = 0; q < n; q++) part = (int16_t)(part + w[p + q]);
+            sum += part;
+        }
         s->offset[j] = 128 * sum;
     }
 }

@@ -96,28 +96,17 @@ void dar_row_put(dar_dtype c, const void *x, dar_dtype stored, void *dst, size_t
 
 /* ---------------------------------------------------------------- whole rows */
 
+float dar_row_scale(dar_dtype stored, const void *x, size_t n)
+{
+    double most = dar_kern_for(dar_compute_type(stored))->max_abs[stored](n, x);
+    float scale = isfinite(most) ? (float)(most / 127) : NAN;
+    return scale < 0x1p-126f ? 0 : scale; /* its inverse may be no number */
+}
+
 float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q)
 {
-    dar_dtype c = dar_compute_type(stored);
-    const dar_kern *k = dar_kern_for(c);
-    size_t size = dar_dtype_size(stored);
-    double buf[DAR_PIECE], most = 0;
-    const void *first = NULL; /* a row of one piece is converted once */
-
-    for (size_t i = 0; i < n; i += DAR_PIECE) {
-        size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
-        first = dar_row_get(c, stored, (const char *)x + i * size, m, buf);
-        double a = k->max_abs(m, first);
-        most = a <= most ? most : a; /* NaN stays */
-        if (!isfinite(most)) break;
-    }
-    float scale = isfinite(most) ? (float)(most / 127) : NAN;
-    if (scale < 0x1p-126f) scale = 0; /* its inverse may be no number */
-    for (size_t i = 0; i < n; i += DAR_PIECE) {
-        size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
-        const void *piece = n <= DAR_PIECE ? first : dar_row_get(c, stored, (const char *)x + i * size, m, buf);
-        k->quantise(m, piece, scale, q + i);
-    }
+    float scale = dar_row_scale(stored, x, n);
+    dar_kern_for(dar_compute_type(stored))->quantise[stored](n, x, scale, 0, q);
     return scale;
 }
 

@@ -80,7 +80,6 @@ typedef struct dar_kern {
     double (*sum_sq)(size_t n, const void *x, double mean); /* of x - mean */
     double (*dot)(size_t n, const void *a, const void *b);
     double (*max)(size_t n, const void *x);          /* ignores NaN; -inf if n = 0 */
-    double (*max_abs)(size_t n, const void *x);      /* 0 if n = 0; NaN or inf if an element is */
     ptrdiff_t (*nonfinite)(size_t n, const void *x); /* index of the first NaN or infinity, or -1 */
 
     /* Softmax of a row in pieces: m = max, s = sum of exp_sum, y scaled by 1 / s.  exp_sum: y = exp(x - m), returns the
@@ -102,9 +101,11 @@ typedef struct dar_kern {
     /* w, m, v in place. */
     void (*adamw)(size_t n, const dar_adamw *a, void *w, void *m, void *v, const void *g);
 
-    /* q = x (1 / scale) to the nearest, ties to even, in [-127, 127]; and back.  q = 0 where scale is not finite or
-     * 1 / scale is not. */
-    void (*quantise)(size_t n, const void *x, float scale, int8_t *q);
+    /* Rows of 8 bits, by stored type of x, i8 NULL.  max_abs: 0 if n = 0; NaN or inf if an element is.  quantise: q = x
+     * (1 / scale) to the nearest, ties to even, for |x| <= 127 scale; q = 0 where scale is not finite or 1 / scale is
+     * not.  Each q is stored as q ^ flip: 0, or 128 for q + 128 as an unsigned byte. */
+    double (*max_abs[DAR_DTYPES])(size_t n, const void *x);
+    void (*quantise[DAR_DTYPES])(size_t n, const void *x, float scale, uint8_t flip, void *q);
     void (*dequantise)(size_t n, const int8_t *q, float scale, void *x);
 
     /* By stored type, f64 and i8 NULL: y[i][j] = (sum[i][j] - offset[j]) (a[i] b[j]), rows ldy apart, j < n. */
@@ -145,8 +146,11 @@ static inline void dar_row_ahead(const void *p, size_t bytes)
     for (size_t i = 0; i < bytes; i += 64) __builtin_prefetch((const char *)p + i);
 }
 
-/* Quantise n stored elements: q = x / scale, scale = max |x| / 127.  A zero row, or one below 2^-119, gives
- * scale 0; a row that is not finite gives zeros with scale NaN, so that it stays visible.  Returns the scale. */
+/* The scale of n stored elements as 8 bits: max |x| / 127.  A zero row, or one below 2^-119, gives 0; a row that is not
+ * finite gives NaN, so that it stays visible. */
+float dar_row_scale(dar_dtype stored, const void *x, size_t n);
+
+/* Quantise n stored elements: q = x / scale, zeros where the scale is 0 or NaN.  Returns the scale. */
 float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q);
 
 /* A step of AdamW over n parameters w with gradients g of arithmetic type c; the moments m, v are stored as `moments`.

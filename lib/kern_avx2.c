@@ -51,10 +51,11 @@ static inline vf v_min(vf a, vf b)
     return _mm256_min_ps(a, b);
 }
 
-/* The larger as unsigned integers. */
-static inline vf v_max_bits(vf a, vf b)
+/* |x| or m, the larger as unsigned integers. */
+static inline vf v_larger(vf x, vf m)
 {
-    return _mm256_castsi256_ps(_mm256_max_epu32(_mm256_castps_si256(a), _mm256_castps_si256(b)));
+    __m256i a = _mm256_castps_si256(_mm256_andnot_ps(_mm256_set1_ps(-0.0f), x));
+    return _mm256_castsi256_ps(_mm256_max_epu32(a, _mm256_castps_si256(m)));
 }
 
 static inline vf v_sqrt(vf x)
@@ -154,6 +155,12 @@ static inline void h_stream(void *p, vh x)
     _mm_stream_si128(p, x);
 }
 
+/* |x| or m, the larger as unsigned integers. */
+static inline vh h_larger(vh x, vh m)
+{
+    return _mm_max_epu16(_mm_and_si128(x, _mm_set1_epi16(0x7fff)), m);
+}
+
 static inline vf v_from_bf16(vh h)
 {
     return _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_cvtepu16_epi32(h), 16));
@@ -192,12 +199,12 @@ static inline vf v_difference(const int32_t *a, const int32_t *b)
         _mm256_sub_epi32(_mm256_loadu_si256((const void *)a), _mm256_loadu_si256((const void *)b)));
 }
 
-/* Numbers in [-127, 127], to the nearest. */
-static inline void v_to_i8(int8_t *p, vf x)
+/* Numbers in [-127, 127], to the nearest, as bytes with the bits of `flip` changed. */
+static inline void v_to_i8(uint8_t *p, vf x, uint8_t flip)
 {
     __m256i i = _mm256_cvtps_epi32(x);
     __m128i h = _mm_packs_epi32(_mm256_castsi256_si128(i), _mm256_extracti128_si256(i, 1));
-    _mm_storel_epi64((void *)p, _mm_packs_epi16(h, h));
+    _mm_storel_epi64((void *)p, _mm_xor_si128(_mm_packs_epi16(h, h), _mm_set1_epi8((char)flip)));
 }
 
 #    include "lib/kern_simd.inc"

@@ -51,10 +51,10 @@ static inline vf v_min(vf a, vf b)
     return _mm512_min_ps(a, b);
 }
 
-/* The larger as unsigned integers. */
-static inline vf v_max_bits(vf a, vf b)
+/* |x| or m, the larger as unsigned integers. */
+static inline vf v_larger(vf x, vf m)
 {
-    return _mm512_castsi512_ps(_mm512_max_epu32(_mm512_castps_si512(a), _mm512_castps_si512(b)));
+    return _mm512_castsi512_ps(_mm512_max_epu32(_mm512_castps_si512(_mm512_abs_ps(x)), _mm512_castps_si512(m)));
 }
 
 static inline vf v_sqrt(vf x)
@@ -152,6 +152,12 @@ static inline void h_stream(void *p, vh x)
     _mm256_stream_si256(p, x);
 }
 
+/* |x| or m, the larger as unsigned integers. */
+static inline vh h_larger(vh x, vh m)
+{
+    return _mm256_max_epu16(_mm256_and_si256(x, _mm256_set1_epi16(0x7fff)), m);
+}
+
 static inline vf v_from_bf16(vh h)
 {
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(h), 16));
@@ -191,10 +197,11 @@ static inline vf v_difference(const int32_t *a, const int32_t *b)
     return _mm512_cvtepi32_ps(_mm512_sub_epi32(_mm512_loadu_si512(a), _mm512_loadu_si512(b)));
 }
 
-/* Numbers in [-127, 127], to the nearest. */
-static inline void v_to_i8(int8_t *p, vf x)
+/* Numbers in [-127, 127], to the nearest, as bytes with the bits of `flip` changed. */
+static inline void v_to_i8(uint8_t *p, vf x, uint8_t flip)
 {
-    _mm_storeu_si128((void *)p, _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(x)));
+    __m128i q = _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(x));
+    _mm_storeu_si128((void *)p, _mm_xor_si128(q, _mm_set1_epi8((char)flip)));
 }
 
 #    include "lib/kern_simd.inc"

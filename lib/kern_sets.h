@@ -9,9 +9,8 @@
 #define DAR_KERN_SLOTS \
     SLOT(exp) SLOT(tanh) SLOT(rsqrt) SLOT(silu) SLOT(gelu_tanh) SLOT(relu) SLOT(silu_back) \
     SLOT(gelu_tanh_back) SLOT(relu_back) SLOT(add) SLOT(mul) SLOT(offset) SLOT(scale) SLOT(axpy) \
-    SLOT(mul_add) SLOT(sum) SLOT(sum_sq) SLOT(dot) SLOT(max) SLOT(max_abs) SLOT(nonfinite) SLOT(exp_sum) \
-    SLOT(softmax_back) SLOT(norm) SLOT(norm_sums) SLOT(norm_back) SLOT(rope) SLOT(adamw) SLOT(quantise) \
-    SLOT(dequantise)
+    SLOT(mul_add) SLOT(sum) SLOT(sum_sq) SLOT(dot) SLOT(max) SLOT(nonfinite) SLOT(exp_sum) \
+    SLOT(softmax_back) SLOT(norm) SLOT(norm_sums) SLOT(norm_back) SLOT(rope) SLOT(adamw) SLOT(dequantise)
 /* clang-format on */
 
 void dar_kern_ref_f32(dar_kern *k); /* fills every slot */

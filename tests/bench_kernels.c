@@ -93,7 +93,7 @@ static void fill_noise(void *ctx, size_t begin, size_t end, int thread)
             h = (h ^ h >> 15) * 2246822519u;
             x[k] = (float)(int32_t)(h ^ h >> 13) * 0x1p-31f;
         }
-        if (f->x->dtype == DAR_I8) dar_kern_for(DAR_F32)->quantise(n, x, 1 / 127.0f, (int8_t *)to);
+        if (f->x->dtype == DAR_I8) dar_kern_for(DAR_F32)->quantise[DAR_F32](n, x, 1 / 127.0f, 0, to);
         else dar_row_convert(f->x->dtype, to, DAR_F32, x, n);
     }
 }

@@ -93,7 +93,6 @@ CALL(sum, v[0] = k->sum(n, x[0]))
 CALL(sum_sq, v[0] = k->sum_sq(n, x[0], 0.3000000001))
 CALL(dot, v[0] = k->dot(n, x[0], x[1]))
 CALL(max, v[0] = k->max(n, x[0]))
-CALL(max_abs, v[0] = k->max_abs(n, x[0]))
 CALL(nonfinite, v[0] = (double)k->nonfinite(n, x[0]))
 CALL(softmax_back, k->softmax_back(n, x[0], x[1], 0.3, x[2]))
 CALL(norm, dar_norm p = norm_of(x, false, false); k->norm(n, &p, x[0], x[1]))
@@ -106,11 +105,32 @@ CALL(rope, k->rope(n / 2 * 2, 6, x[0], x[1], x[2], false))
 CALL(rope_long, k->rope(n / 2 * 2, 70, x[0], x[1], x[0], true))
 CALL(adamw, k->adamw(n, &adamw, x[0], x[1], x[4], x[2]))
 
-/* 8-bit rows lie in row 1: as many bytes as elements. */
-CALL(quantise, k->quantise(n, x[0], 0.0042f, x[1]))
-CALL(quantise_saturates, k->quantise(n, x[0], 0.001f, x[1]))
-CALL(quantise_nothing, k->quantise(n, x[0], 0, x[1]))
-CALL(dequantise, k->quantise(n, x[0], 0.0042f, x[1]); k->dequantise(n, x[1], 0.0042f, x[2]))
+/* 8-bit rows lie in row 1, as many bytes as elements; f32 ones with flipped signs and those of 16 bits one after the
+ * other. */
+static const dar_dtype halves[] = { DAR_BF16, DAR_F16 };
+
+CALL(quantise_nothing, k->quantise[DAR_F32](n, x[0], 0, 128, x[1]))
+CALL(dequantise, k->quantise[s->type](n, x[0], 0.0081f, 0, x[1]); k->dequantise(n, x[1], 0.0081f, x[2]))
+
+static void call_quantise(const dar_kern *k, size_t n, struct rows *s)
+{
+    uint16_t buf[LONGEST];
+    k->quantise[DAR_F32](n, s->row[0], 0.0081f, 128, s->row[1]);
+    for (size_t t = 0; t < DAR_COUNT(halves); t++) {
+        dar_row_convert(halves[t], buf, s->type, s->row[0], n);
+        k->quantise[halves[t]](n, buf, 0.0081f, 0, (char *)s->row[1] + (t + 1) * n);
+    }
+}
+
+static void call_max_abs(const dar_kern *k, size_t n, struct rows *s)
+{
+    uint16_t buf[LONGEST];
+    s->value[0] = k->max_abs[s->type](n, s->row[0]);
+    for (size_t t = 0; t < DAR_COUNT(halves); t++) {
+        dar_row_convert(halves[t], buf, s->type, s->row[0], n);
+        s->value[t + 1] = k->max_abs[halves[t]](n, buf);
+    }
+}
 
 static void call_scale_sums(const dar_kern *k, size_t n, struct rows *s)
 {
@@ -172,7 +192,6 @@ static const struct {
     kernel_call *call;
 } bytes[] = {
     { "quantise", call_quantise },
-    { "quantise_saturates", call_quantise_saturates },
     { "quantise_nothing", call_quantise_nothing },
 };
 
@@ -190,7 +209,7 @@ static void same_as_reference(const char *name, kernel_call *call, size_t n)
         for (size_t r = 0; r < ROWS; r++)
             CHECK(memcmp(found.row[r], expected.row[r], n * sizeof(float)) == 0,
                   "%s of %zu, %s: row %zu is not that of the reference", name, n, tables.f32[k].name, r);
-        for (int i = 0; i < 2; i++)
+        for (size_t i = 0; i < DAR_COUNT(found.value); i++)
             CHECK(found.value[i] == expected.value[i], "%s of %zu, %s: value %.17g, reference %.17g", name, n,
                   tables.f32[k].name, found.value[i], expected.value[i]);
     }
@@ -211,7 +230,7 @@ static void exact_kernels(void **state)
                     if (exact[c].call == call_dequantise && r == 1) continue; /* bytes */
                     CHECK_NEAR(exact[c].name, ((float *)expected.row[r])[i], ((double *)truth.row[r])[i], bound);
                 }
-            for (int i = 0; i < 2; i++)
+            for (size_t i = 0; i < DAR_COUNT(truth.value); i++)
                 CHECK(expected.value[i] == truth.value[i] || fabs(expected.value[i] - truth.value[i]) <= bound,
                       "%s of %zu: %.17g, f64 %.17g", exact[c].name, n, expected.value[i], truth.value[i]);
         }
@@ -354,6 +373,7 @@ static void reductions_see_everything(void **state)
 {
     (void)state;
     float x[100];
+    uint16_t half[100];
     for (int k = 0; k < tables.n; k++)
         for (size_t n = 1; n <= 100; n++)
             for (size_t at = 0; at < n; at++) {
@@ -361,10 +381,14 @@ static void reductions_see_everything(void **state)
                 x[at] = -2;
                 CHECK_NEAR("max", tables.f32[k].max(n, x), -2, 0);
                 x[at] = -5;
-                CHECK_NEAR("max_abs", tables.f32[k].max_abs(n, x), 5, 0);
+                CHECK_NEAR("max_abs", tables.f32[k].max_abs[DAR_F32](n, x), 5, 0);
                 x[at] = at % 2 ? NAN : -INFINITY;
                 CHECK(tables.f32[k].nonfinite(n, x) == (ptrdiff_t)at, "nonfinite %zu of %zu", at, n);
-                CHECK(!isfinite(tables.f32[k].max_abs(n, x)), "max_abs of %zu: element %zu is not finite", n, at);
+                CHECK(!isfinite(tables.f32[k].max_abs[DAR_F32](n, x)), "max_abs of %zu: %zu is not finite", n, at);
+                for (size_t t = 0; t < DAR_COUNT(halves); t++) {
+                    dar_row_convert(halves[t], half, DAR_F32, x, n);
+                    CHECK(!isfinite(tables.f32[k].max_abs[halves[t]](n, half)), "max_abs of %zu: %zu is not", n, at);
+                }
                 if (n > 1) CHECK_NEAR("max", tables.f32[k].max(n, x), -3, 0);
             }
 }
