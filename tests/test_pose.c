@@ -254,6 +254,62 @@ static void add_triangle(int *position, int *normal)
     *normal = GLB_F32(&g, 3, n);
 }
 
+/* A spline moves, turns and morphs a triangle.  Halfway between keys 2 s apart Hermite's weights are 1/2, 1/4, 1/2,
+ * -1/4, so values are (p + q) / 2 + (out - in) / 4. */
+static void cubic(void **state)
+{
+    (void)state;
+    static const float time[2] = { 1, 3 };
+    static const float move[2][3][3] = { { { 9, 9, 9 }, { 1, 2, 3 }, { 4, 0, -8 } },
+                                         { { 0, 4, 8 }, { 5, 2, -3 }, { 9, 9, 9 } } };
+    /* From no turn to half a turn about z; tangents that leave (0, 0, 0.3, 0.4) halfway. */
+    static const float turn[2][3][4] = { { { 9, 9, 9, 9 }, { 0, 0, 0, 1 }, { 0, 0, -0.8f, -0.4f } },
+                                         { { 0, 0, 0, 0 }, { 0, 0, 1, 0 }, { 9, 9, 9, 9 } } };
+    static const float weight[2][3][2] = { { { 9, 9 }, { 0, 0 }, { 0, 2 } }, { { 0, 0 }, { 0.5f, 0 }, { 9, 9 } } };
+    static const float dx[2][3][3] = { { { 0, 0, 0 }, { 4, 0, 0 }, { 0, 0, 0 } },
+                                       { { 0, 0, 2 }, { 0, 0, 0 }, { 0, 0, 0 } } };
+    dar_scene s;
+    posed p;
+    int a, b;
+    start();
+    add_triangle(&a, &b);
+    int t = GLB_F32(&g, 1, time), m = GLB_F32(&g, 3, move), q = GLB_F32(&g, 4, turn), w = GLB_F32(&g, 1, weight),
+        d0 = GLB_F32(&g, 3, dx[0]), d1 = GLB_F32(&g, 3, dx[1]);
+    GLB_REST(
+        &g,
+        "\"meshes\":[{\"primitives\":[{\"attributes\":{\"POSITION\":%d,\"NORMAL\":%d},\"targets\":[{\"POSITION\":%d},"
+        "{\"POSITION\":%d}]}]}],\"nodes\":[{\"mesh\":0}],",
+        a, b, d0, d1);
+    GLB_REST(&g, "\"animations\":[{\"channels\":[");
+    for (int k = 0; k < 3; k++)
+        GLB_REST(&g, "%s{\"sampler\":%d,\"target\":{\"node\":0,\"path\":\"%s\"}}", k ? "," : "", k,
+                 k == 0   ? "translation"
+                 : k == 1 ? "rotation"
+                          : "weights");
+    GLB_REST(&g, "],\"samplers\":[");
+    for (int k = 0; k < 3; k++)
+        GLB_REST(&g, "%s{\"input\":%d,\"output\":%d,\"interpolation\":\"CUBICSPLINE\"}", k ? "," : "", t,
+                 k == 0   ? m
+                 : k == 1 ? q
+                          : w);
+    GLB_REST(&g, "]}]");
+    glb_load(&g, &s);
+    posed_init(&p, &s);
+    posed_at(&p, 0, 1);
+    check_row("first key", p.position, 1, 2, 2, 3, EPS);
+    /* Place (3, 2, 0) + ((4, 0, -8) - (0, 4, 8)) / 4 = (4, 1, -4); turn (0, 0, 0.6, 0.8) once unit: cosine 0.28, sine
+     * 0.96; weights 1/4 and 1/2: corners (0, 0, 1), (2, 0, 0), (0, 1, 0) before it. */
+    posed_at(&p, 0, 2);
+    check_row("halfway", p.position, 0, 4, 1, -3, 8 * EPS);
+    check_row("halfway", p.position, 1, 4 + 2 * 0.28, 1 + 2 * 0.96, -4, 8 * EPS);
+    check_row("halfway", p.position, 2, 4 - 0.96, 1 + 0.28, -4, 8 * EPS);
+    check_row("halfway", p.normal, 2, 0.6 * 0.28, 0.6 * 0.96, 0.8, 4 * EPS);
+    posed_at(&p, 0, 9);
+    check_row("last key", p.position, 1, 5 - 3, 2, -3, 4 * EPS);
+    posed_free(&p);
+    dar_scene_free(&s);
+}
+
 static void instances(void **state)
 {
     (void)state;
@@ -496,9 +552,9 @@ static void robot(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(skin),      cmocka_unit_test(morph), cmocka_unit_test(rows),    cmocka_unit_test(rotations),
-        cmocka_unit_test(instances), cmocka_unit_test(flat),  cmocka_unit_test(changes), cmocka_unit_test(too_large),
-        cmocka_unit_test(models),    cmocka_unit_test(robot),
+        cmocka_unit_test(skin),      cmocka_unit_test(morph),     cmocka_unit_test(rows),  cmocka_unit_test(rotations),
+        cmocka_unit_test(cubic),     cmocka_unit_test(instances), cmocka_unit_test(flat),  cmocka_unit_test(changes),
+        cmocka_unit_test(too_large), cmocka_unit_test(models),    cmocka_unit_test(robot),
     };
     return cmocka_run_group_tests_name("pose", tests, NULL, NULL) != 0;
 }

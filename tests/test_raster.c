@@ -4,7 +4,7 @@
 #include <unistd.h>
 
 #include "data/gltf.h"
-#include "data/world.h"
+#include "data/rays.h"
 
 #define ASSETS "../shared/assets/"
 
@@ -76,6 +76,17 @@ static void check_hit(const drawn *d, const dar_view *v, const hit *h, size_t at
     CHECK_NEAR("length of the normal", dot, 1, 1e-6);
 }
 
+/* Position from what is stored alone: the camera, its ray and depth. */
+static void check_back_projected(const drawn *d, const dar_view *v, size_t at, double size)
+{
+    double o[3], r[3], along = 0;
+    size_t width = (size_t)v->width;
+    dar_rays_at(v, (double)(at % width) + 0.5, (double)(at / width) + 0.5, o, r);
+    for (int c = 0; c < 3; c++) along += v->c2w[4 * c + 2] * r[c];
+    for (size_t c = 0; c < 3; c++)
+        CHECK_NEAR("back-projected", o[c] + d->g.depth[at] / along * r[c], d->g.world[c * d->pixels + at], 1e-5 * size);
+}
+
 static void check_empty(const drawn *d, size_t at)
 {
     assert_int_equal(d->g.instance[at], 0);
@@ -130,7 +141,8 @@ static size_t check_rays(drawn *d, const dar_view *v)
         uint32_t instance = 0, triangle = 0;
         bool shown = dar_raster_at(&d->raster, x, y, &instance, &triangle);
         assert_int_equal(d->g.mask[at], shown);
-        if (!shown) check_empty(d, at);
+        if (shown) check_back_projected(d, v, at, size);
+        else check_empty(d, at);
         hits += shown;
         if (shown == c.cast[at] && (!shown || (instance == h->instance && triangle == h->triangle))) {
             if (shown) check_hit(d, v, h, at, size);
