@@ -1,4 +1,7 @@
-/* h5.c: the only user of HDF5. */
+/* h5.c: the only user of HDF5.
+ *
+ * Chunks are unpacked here: the library takes whatever its filters leave for a whole chunk, so that a damaged file
+ * makes it read past the end. */
 #include "data/h5.h"
 
 #include <hdf5.h>
@@ -7,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "data/deflate.h"
 #include "lib/file.h"
 
 #define DEFLATE_LEVEL 1
@@ -15,6 +19,8 @@ struct dar_h5 {
     hid_t id; /* negative: closed */
     bool writing;
     dar_file_out out;
+    unsigned char *scratch; /* of one chunk on its way */
+    size_t room;
     char path[PATH_MAX];
 };
 
@@ -132,6 +138,7 @@ void dar_h5_close(dar_h5 *f)
     silence();
     if (f->id >= 0) H5Fclose(f->id);
     dar_file_discard(&f->out);
+    free(f->scratch);
     free(f);
 }
 
@@ -195,29 +202,42 @@ bool dar_h5_has(dar_h5 *f, const char *name)
     }
 }
 
-/* Another file's data, or code loaded for a filter, must not come in through this one. */
-static bool plain_storage(hid_t p, uint64_t *chunk_bytes, size_t size)
+/* How a dataset lies in the file. */
+struct storage {
+    hsize_t chunk[DAR_H5_RANK];
+    uint64_t bytes; /* of a chunk; 0: contiguous */
+    size_t element;
+    bool shuffle, deflate;
+};
+
+/* Filters other than shuffle, then deflate: no.  Chunks' masks number them in this order. */
+static bool filters_of(hid_t p, struct storage *s)
+{
+    int n = H5Pget_nfilters(p);
+    if (n < 0 || n > 2) return false;
+    for (int i = 0; i < n; i++) {
+        unsigned flags, config, value[8] = { 0 };
+        size_t values = DAR_COUNT(value);
+        H5Z_filter_t x = H5Pget_filter2(p, (unsigned)i, &flags, &values, value, 0, NULL, &config);
+        if (x == H5Z_FILTER_SHUFFLE && i == 0) s->shuffle = values == 1 && value[0] == s->element;
+        else if (x == H5Z_FILTER_DEFLATE && i == n - 1) s->deflate = true;
+        else return false;
+    }
+    return s->shuffle + s->deflate == n;
+}
+
+/* False for what is not read: another file's data, and code loaded for a filter. */
+static bool storage_of(hid_t p, const dar_h5_array *a, struct storage *s)
 {
     H5D_layout_t layout = H5Pget_layout(p);
-    hsize_t chunk[DAR_H5_RANK];
-    *chunk_bytes = 0;
-    if (layout == H5D_CHUNKED) {
-        int rank = H5Pget_chunk(p, DAR_H5_RANK, chunk);
-        if (rank < 1 || rank > DAR_H5_RANK) return false;
-        *chunk_bytes = size;
-        for (int i = 0; i < rank; i++)
-            if (__builtin_mul_overflow(*chunk_bytes, chunk[i], chunk_bytes)) return false;
-    } else if (layout != H5D_CONTIGUOUS && layout != H5D_COMPACT) {
-        return false;
-    }
-    int filters = H5Pget_nfilters(p);
-    for (int i = 0; i < filters; i++) {
-        unsigned flags, config;
-        size_t none = 0;
-        H5Z_filter_t x = H5Pget_filter2(p, (unsigned)i, &flags, &none, NULL, 0, NULL, &config);
-        if (x != H5Z_FILTER_DEFLATE && x != H5Z_FILTER_SHUFFLE && x != H5Z_FILTER_FLETCHER32) return false;
-    }
-    return filters >= 0 && H5Pget_external_count(p) == 0;
+    *s = (struct storage){ .element = types[a->type].size };
+    if (H5Pget_external_count(p) != 0) return false;
+    if (layout == H5D_CONTIGUOUS) return true;
+    if (layout != H5D_CHUNKED || H5Pget_chunk(p, DAR_H5_RANK, s->chunk) != a->rank) return false;
+    s->bytes = s->element;
+    for (int i = 0; i < a->rank; i++)
+        if (!s->chunk[i] || __builtin_mul_overflow(s->bytes, s->chunk[i], &s->bytes)) return false;
+    return filters_of(p, s);
 }
 
 static const char *describe(char *to, size_t size, const char *type, int rank, const hsize_t *dim)
@@ -258,7 +278,7 @@ static dar_status compare(const dar_h5 *f, const char *name, dar_h5_array *a, hi
 dar_status dar_h5_expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *e)
 {
     dar_status s = DAR_OK;
-    uint64_t chunk;
+    struct storage in;
     check_array(name, a);
     silence();
     if (!dar_h5_has(f, name)) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found nothing of this name", f->path, name);
@@ -268,18 +288,113 @@ dar_status dar_h5_expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *
 
     if (type < 0 || space < 0 || p < 0) {
         s = refused(f, name, "cannot read the header", e);
-    } else if (!plain_storage(p, &chunk, types[a->type].size)) {
-        s = dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found another file's data or an unknown filter, expected deflate",
+    } else if ((s = compare(f, name, a, type, space, e)) != DAR_OK) {
+        /* said */
+    } else if (!storage_of(p, a, &in)) {
+        s = dar_fail(e, DAR_ERR_FORMAT,
+                     "%s: %s: found another file's data or an unknown filter, expected none but shuffle and deflate",
                      f->path, name);
-    } else if ((s = compare(f, name, a, type, space, e)) == DAR_OK && chunk > DAR_H5_CHUNK_MAX) {
+    } else if (in.bytes > DAR_H5_CHUNK_MAX) {
         s = dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found chunks of %" PRIu64 " bytes, expected at most %" PRIu64, f->path,
-                     name, chunk, DAR_H5_CHUNK_MAX);
+                     name, in.bytes, DAR_H5_CHUNK_MAX);
     }
     if (p >= 0) H5Pclose(p);
     if (space >= 0) H5Sclose(space);
     if (type >= 0) H5Tclose(type);
     H5Dclose(set);
     return s;
+}
+
+/* ---------------------------------------------------------------- reading and writing */
+
+static dar_status broken(const dar_h5 *f, const char *name, const hsize_t *at, dar_err *e)
+{
+    return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: the chunk of row %" PRIuHSIZE " is damaged", f->path, name, at[0]);
+}
+
+/* The chunk that begins at `at`, plain, in *out, which is in f->scratch. */
+static dar_status read_chunk(dar_h5 *f, const char *name, hid_t set, const struct storage *s, const hsize_t *at,
+                             const unsigned char **out, dar_err *e)
+{
+    unsigned char *packed = f->scratch, *plain = packed + dar_deflate_bound(s->bytes), *last = plain + s->bytes;
+    haddr_t address = HADDR_UNDEF;
+    hsize_t size = 0;
+    unsigned mask = 0;
+    uint32_t again;
+
+    if (H5Dget_chunk_info_by_coord(set, at, &mask, &address, &size) < 0) return refused(f, name, "cannot read", e);
+    if (address == HADDR_UNDEF) {
+        *out = memset(last, 0, s->bytes);
+        return DAR_OK;
+    }
+    bool shuffled = s->shuffle && !(mask & 1), deflated = s->deflate && !(mask >> s->shuffle & 1);
+    if (deflated ? size > dar_deflate_bound(s->bytes) : size != s->bytes) return broken(f, name, at, e);
+    if (H5Dread_chunk(set, H5P_DEFAULT, at, &again, packed) < 0) return refused(f, name, "cannot read", e);
+    if (!deflated) plain = packed;
+    else if (!dar_inflate(packed, size, plain, s->bytes)) return broken(f, name, at, e);
+    if (shuffled) dar_unshuffle(plain, s->bytes, s->element, last);
+    *out = shuffled ? last : plain;
+    return DAR_OK;
+}
+
+/* Where a chunk and the rows that are wanted meet, innermost dimension first: indices, and their steps in bytes. */
+struct meeting {
+    uint64_t count[DAR_H5_RANK];
+    size_t from[DAR_H5_RANK], to[DAR_H5_RANK];
+};
+
+static void copy_part(const struct meeting *m, int k, const unsigned char *from, unsigned char *to)
+{
+    if (k == 0) memcpy(to, from, m->count[0] * m->to[0]);
+    else
+        for (uint64_t i = 0; i < m->count[k]; i++) copy_part(m, k - 1, from + i * m->from[k], to + i * m->to[k]);
+}
+
+static void place(const struct storage *s, const dar_h5_array *a, const hsize_t *at, uint64_t first, uint64_t count,
+                  const unsigned char *from, unsigned char *to)
+{
+    struct meeting m;
+    size_t from_step = s->element, to_step = s->element;
+    for (int k = 0; k < a->rank; k++) {
+        int i = a->rank - 1 - k;
+        uint64_t begin = i ? 0 : first, end = i ? a->dim[i] : first + count;
+        uint64_t lo = at[i] > begin ? at[i] : begin, hi = at[i] + s->chunk[i] < end ? at[i] + s->chunk[i] : end;
+        m.count[k] = hi - lo;
+        m.from[k] = from_step;
+        m.to[k] = to_step;
+        from += (lo - at[i]) * from_step;
+        to += (lo - begin) * to_step;
+        from_step *= s->chunk[i];
+        to_step *= end - begin;
+    }
+    copy_part(&m, a->rank - 1, from, to);
+}
+
+/* All chunks that meet these rows.  Scratch: one packed, shuffled, plain. */
+static dar_status read_chunks(dar_h5 *f, const char *name, hid_t set, const struct storage *s, const dar_h5_array *a,
+                              uint64_t first, uint64_t count, unsigned char *to, dar_err *e)
+{
+    size_t need = dar_deflate_bound(s->bytes) + 2 * s->bytes;
+    hsize_t at[DAR_H5_RANK] = { first / s->chunk[0] * s->chunk[0] };
+    const unsigned char *from = NULL;
+    if (f->room < need) {
+        free(f->scratch);
+        f->scratch = malloc(need);
+        f->room = f->scratch ? need : 0;
+        if (!f->scratch)
+            return dar_fail(e, DAR_ERR_NOMEM, "%s: %s: chunks of %" PRIu64 " bytes", f->path, name, s->bytes);
+    }
+    for (;;) {
+        DAR_TRY(read_chunk(f, name, set, s, at, &from, e));
+        place(s, a, at, first, count, from, to);
+        int i = a->rank - 1;
+        for (; i >= 0; i--) { /* the next chunk, last index fastest */
+            at[i] += s->chunk[i];
+            if (at[i] < (i ? a->dim[i] : first + count)) break;
+            at[i] = 0;
+        }
+        if (i < 0) return DAR_OK;
+    }
 }
 
 /* One of `to` and `from` is NULL. */
@@ -292,15 +407,21 @@ static dar_status transfer(dar_h5 *f, const char *name, const dar_h5_array *a, u
                "%s: %" PRIu64 " from %" PRIu64 " of %" PRIu64, name, count, first, a->dim[0]);
     for (int i = 0; i < a->rank; i++) n[i] = i ? a->dim[i] : count;
     silence();
-    hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT), memory = space_of(a, count),
-          space = set < 0 ? set : H5Dget_space(set);
-    herr_t done = -1;
-    if (memory >= 0 && space >= 0 && H5Sselect_hyperslab(space, H5S_SELECT_SET, start, NULL, n, NULL) >= 0)
-        done = to ? H5Dread(set, stored_type(a->type), memory, space, H5P_DEFAULT, to)
-                  : H5Dwrite(set, stored_type(a->type), memory, space, H5P_DEFAULT, from);
-    dar_status s = done < 0 ? refused(f, name, to ? "cannot read" : "cannot write", e) : DAR_OK;
+    hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT), p = set < 0 ? set : H5Dget_create_plist(set),
+          memory = space_of(a, count), space = set < 0 ? set : H5Dget_space(set);
+    struct storage in = { 0 };
+    dar_status s = DAR_OK;
+    if (p < 0 || memory < 0 || space < 0 || H5Sselect_hyperslab(space, H5S_SELECT_SET, start, NULL, n, NULL) < 0 ||
+        !storage_of(p, a, &in))
+        s = refused(f, name, "cannot open", e);
+    else if (from && H5Dwrite(set, stored_type(a->type), memory, space, H5P_DEFAULT, from) < 0)
+        s = refused(f, name, "cannot write", e);
+    else if (to && in.bytes) s = read_chunks(f, name, set, &in, a, first, count, to, e);
+    else if (to && H5Dread(set, stored_type(a->type), memory, space, H5P_DEFAULT, to) < 0)
+        s = refused(f, name, "cannot read", e);
     if (space >= 0) H5Sclose(space);
     if (memory >= 0) H5Sclose(memory);
+    if (p >= 0) H5Pclose(p);
     if (set >= 0) H5Dclose(set);
     return s;
 }

@@ -49,7 +49,8 @@ dar_status dar_h5_make(dar_h5 *f, const char *name, const dar_h5_array *a, dar_e
 bool dar_h5_has(dar_h5 *f, const char *name);
 
 /* The dataset must have this type, rank and dimensions; a dimension of 0 stands for any and is filled in.  `chunk` is
- * not compared.  Nothing is allocated before that. */
+ * not compared: chunks may have any shape, plain or shuffled and deflated, or there are none.  Nothing is allocated
+ * before that. */
 dar_status dar_h5_expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *e);
 
 /* Leading indices [first, first + count) of an array made or expected as `a`; `data` holds count elements of

@@ -4,6 +4,7 @@
     safetensors    reference.safetensors   pip install torch==2.13.0 safetensors numpy
     torch_rng      torch_rng.json          pip install torch==2.13.0 numpy; on a processor with AVX2
     solvers        solvers.json            pip install torch==2.13.0 diffusers==0.42.1
+    h5             foreign.h5              pip install h5py==3.16.0 numpy
     corpus         ../corpus/              nothing
 
 Run from the root of the tree.  The tests need none of this: the files are committed.
@@ -28,6 +29,20 @@ def safetensors():
         "tests/fixtures/reference.safetensors",
         metadata={"made by": "the reference writer"},
     )
+
+
+def h5():
+    """Arrays 1000 + their index, laid out as other writers may: chunks of any shape, with and without filters."""
+    import h5py
+    import numpy as np
+
+    x = (1000 + np.arange(5 * 3 * 7)).reshape(5, 3, 7)
+    with h5py.File("tests/fixtures/foreign.h5", "w") as f:
+        f.create_dataset("odd", data=x.astype("u2"), chunks=(2, 2, 4), compression="gzip")
+        f.create_dataset("shuffled", data=x.astype("f4"), chunks=(3, 3, 7), shuffle=True)
+        f.create_dataset("bare", data=x.astype("u4"), chunks=(1, 1, 5))
+        f.create_dataset("whole", data=x.astype("i2"))
+        f.create_dataset("summed", data=x.astype("u2"), chunks=(1, 3, 7), fletcher32=True)
 
 
 def torch_rng():
@@ -364,7 +379,7 @@ def image_files():
 
 
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (safetensors, torch_rng, solvers, corpus)}
+    known = {f.__name__: f for f in (safetensors, torch_rng, solvers, h5, corpus)}
     if not sys.argv[1:] or any(name not in known for name in sys.argv[1:]):
         sys.exit(__doc__)
     for name in sys.argv[1:]:

@@ -7,12 +7,14 @@
 #include "data/h5.h"
 #include "lib/file.h"
 
-/* Read by the address sanitizer.  HDF5 1.10 loses the message of a damaged header that it gives up decoding; the
- * decoder has no name in the library, so the leak is known by its caller, whom only the slow unwinder finds. */
+/* Read by the address sanitizer.  HDF5 1.10 does not give back what it holds of a damaged header that it gives up on:
+ * its own objects (all that H5FL_... hands out; handles that we forget are reachable), and
+ * one message.  The decoder of that has no name in the library, so it is known by its caller, whom only the slow
+ * unwinder finds. */
 const char *__lsan_default_suppressions(void);
 const char *__lsan_default_suppressions(void)
 {
-    return "leak:H5O_msg_read_oh";
+    return "leak:H5FL_\nleak:H5O_msg_read_oh\n";
 }
 
 const char *__asan_default_options(void);
@@ -96,6 +98,47 @@ static void several_rows(void **state)
     dar_h5_close(f);
 }
 
+/* tests/fixtures/foreign.h5: 1000, 1001, ... in layouts of another writer. */
+static void foreign(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *name;
+        dar_h5_type type;
+    } row[] = { { "odd", DAR_H5_U16 }, { "shuffled", DAR_H5_F32 }, { "bare", DAR_H5_U32 }, { "whole", DAR_H5_I16 } };
+    dar_err e;
+    dar_h5 *f;
+    ok(dar_h5_open(&f, "tests/fixtures/foreign.h5", &e), &e);
+    for (size_t i = 0; i < DAR_COUNT(row); i++) {
+        dar_h5_array a = { .type = row[i].type, .rank = 3 };
+        union {
+            uint16_t u16[5 * 21];
+            int16_t i16[5 * 21];
+            uint32_t u32[5 * 21];
+            float f32[5 * 21];
+        } x;
+        ok(dar_h5_expect(f, row[i].name, &a, &e), &e);
+        CHECK(a.dim[0] == 5 && a.dim[1] == 3 && a.dim[2] == 7, "%s: dimensions", row[i].name);
+        for (uint64_t first = 0; first < 5; first++)
+            for (uint64_t count = 1; first + count <= 5; count++) {
+                memset(&x, 0xff, sizeof x);
+                ok(dar_h5_read(f, row[i].name, &a, first, count, &x, &e), &e);
+                for (size_t k = 0; k < 21 * count; k++) {
+                    double found = a.type == DAR_H5_U16   ? x.u16[k]
+                                   : a.type == DAR_H5_I16 ? x.i16[k]
+                                   : a.type == DAR_H5_U32 ? x.u32[k]
+                                                          : (double)x.f32[k];
+                    CHECK_NEAR(row[i].name, found, 1000 + 21 * (double)first + (double)k, 0);
+                }
+                size_t end = 21 * count * dar_h5_type_size(a.type);
+                CHECK(end == sizeof x || ((unsigned char *)&x)[end] == 0xff, "%s: written past the end", row[i].name);
+            }
+    }
+    dar_h5_array a = { .type = DAR_H5_U16, .rank = 3 };
+    CHECK(dar_h5_expect(f, "summed", &a, &e) == DAR_ERR_FORMAT && strstr(e.text, "unknown filter"), "%s", e.text);
+    dar_h5_close(f);
+}
+
 static void attributes(void **state)
 {
     (void)state;
@@ -171,7 +214,18 @@ static void never_half(void **state)
     refused(dar_h5_create(&f, in_dir("none/half.h5"), &e), &e, "No such file");
 }
 
-/* A file cut short, or with any one byte of its head changed: a status, never a fault. */
+/* Written plainly: flushing thousands of files to the disk takes seconds. */
+static void write_hurt(const unsigned char *data, size_t size, size_t at, bool cut)
+{
+    FILE *o = fopen(in_dir("hurt.h5"), "wb");
+    assert_non_null(o);
+    fwrite(data, 1, at, o);
+    if (!cut) fputc(~data[at] & 0xff, o);
+    if (!cut) fwrite(data + at + 1, 1, size - at - 1, o);
+    assert_int_equal(fclose(o), 0);
+}
+
+/* A file cut short, or with any one byte changed: a status, never a fault. */
 static void damaged(void **state)
 {
     (void)state;
@@ -187,16 +241,10 @@ static void damaged(void **state)
     ok(dar_h5_commit(f, &e), &e);
     dar_h5_close(f);
     ok(dar_file_map_open(&m, in_dir("whole.h5"), &e), &e);
-    for (size_t i = 0; i < 2 * m.size; i += 41) {
-        dar_file_out o;
+    for (size_t i = 0; i < 2 * m.size; i += i < m.size ? 1 : 13) {
         bool cut = i >= m.size;
         size_t at = i % m.size;
-        unsigned char flipped = (unsigned char)~m.data[at];
-        ok(dar_file_create(&o, in_dir("hurt.h5"), &e), &e);
-        ok(dar_file_write(&o, m.data, at, &e), &e);
-        if (!cut) ok(dar_file_write(&o, &flipped, 1, &e), &e);
-        if (!cut) ok(dar_file_write(&o, m.data + at + 1, m.size - at - 1, &e), &e);
-        ok(dar_file_commit(&o, &e), &e);
+        write_hurt(m.data, m.size, at, cut);
         dar_status s = dar_h5_open(&f, in_dir("hurt.h5"), &e);
         dar_h5_array b = a;
         if (s == DAR_OK) s = dar_h5_expect(f, "x", &b, &e);
@@ -224,8 +272,9 @@ static int tear_down(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = { cmocka_unit_test(round_trip), cmocka_unit_test(several_rows),
-                                        cmocka_unit_test(attributes), cmocka_unit_test(does_not_fit),
-                                        cmocka_unit_test(never_half), cmocka_unit_test(damaged) };
+    const struct CMUnitTest tests[] = { cmocka_unit_test(round_trip),   cmocka_unit_test(several_rows),
+                                        cmocka_unit_test(foreign),      cmocka_unit_test(attributes),
+                                        cmocka_unit_test(does_not_fit), cmocka_unit_test(never_half),
+                                        cmocka_unit_test(damaged) };
     return cmocka_run_group_tests(tests, set_up, tear_down) != 0;
 }
