@@ -63,7 +63,7 @@ void dar_tape_clear(dar_tape *t)
     *t = fresh;
 }
 
-static void *push_meta(dar_tape *t, size_t bytes)
+void *dar_tape_room(dar_tape *t, size_t bytes)
 {
     return memset(dar_arena_push(&t->meta, bytes), 0, bytes);
 }
@@ -75,7 +75,7 @@ void *dar_tape_store(dar_tape *t, const void *data, size_t bytes)
 
 static dar_val *push_val(dar_tape *t, dar_tensor x)
 {
-    dar_val *v = push_meta(t, sizeof *v);
+    dar_val *v = dar_tape_room(t, sizeof *v);
     v->x = x;
     return v;
 }
@@ -186,7 +186,7 @@ static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool sav
 
 static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val *const *in, int n, dar_val *y)
 {
-    dar_node *node = push_meta(t, sizeof *node);
+    dar_node *node = dar_tape_room(t, sizeof *node);
     void *attr = op->attr_size ? dar_tape_store(t, c->attr, op->attr_size) : NULL;
     *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = attr, .aux = c->aux };
     memcpy(node->in, in, (size_t)n * sizeof *in);
@@ -257,7 +257,7 @@ static void ensure_grad(dar_tape *t, dar_val *v)
 static void release_grad(dar_tape *t, dar_val *v)
 {
     if (v->leaf || !v->g.data) return;
-    struct dar_spare *s = push_meta(t, sizeof *s);
+    struct dar_spare *s = dar_tape_room(t, sizeof *s);
     *s = (struct dar_spare){ t->spare, grad_bytes(v), v->g.data };
     t->spare = s;
     v->g.data = NULL;
@@ -352,7 +352,7 @@ static void stand_in(dar_tape *t, const dar_node *node, dar_val **in)
         for (int j = 0; j < i; j++)
             if (node->in[j] == node->in[i]) in[i] = in[j];
         if (!node->in[i] || in[i]) continue;
-        in[i] = push_meta(t, sizeof *in[i]);
+        in[i] = dar_tape_room(t, sizeof *in[i]);
         *in[i] = *node->in[i];
         in[i]->leaf = true; /* its gradient is not the segment's to free */
     }
@@ -419,9 +419,9 @@ dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const 
     DAR_ASSERT(n >= 0 && n <= DAR_OP_IN, "segment: %d inputs, at most %d", n, DAR_OP_IN);
     for (int i = 0; i < n; i++) check_origin(t, in[i]);
     dar_val *y = push_val(t, dar_tensor_push(t->arena, type, shape));
-    dar_node *node = push_meta(t, sizeof *node);
+    dar_node *node = dar_tape_room(t, sizeof *node);
     *node = (dar_node){ .prev = t->last, .n = n, .y = y, .fn = fn, .arg = arg };
-    node->kept = push_meta(t, sizeof *node->kept);
+    node->kept = dar_tape_room(t, sizeof *node->kept);
     for (int i = 0; i < n; i++) node->in[i] = in[i];
 
     struct place p = enter(t);

@@ -74,6 +74,7 @@ dar_val *dar_input(dar_tape *t, dar_dtype type, dar_shape s);
 
 /* A copy of `bytes` that lives as long as the values made now: arguments of segments. */
 void *dar_tape_store(dar_tape *t, const void *data, size_t bytes);
+void *dar_tape_room(dar_tape *t, size_t bytes); /* the same, zeroed */
 
 /* Run op on n inputs (NULL: absent).  attr is copied.  Inputs that are strided views are copied to contiguous memory
  * first. */
