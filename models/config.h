@@ -1,0 +1,96 @@
+/* config.h: sizes of the networks and what the paper leaves open about them, read from JSON (models/presets).
+ *
+ *   key                values          default  what
+ *   name               text            needed   of the preset
+ *
+ *   dit.width          6 ..            needed   D: features of a token
+ *   dit.heads          1 ..            needed   A: attention heads; D / A is even and at least 6
+ *   dit.layers         1 ..            needed   L: blocks
+ *   dit.ffn            1 ..            needed   F: features inside the feed-forward layer
+ *   dit.latent         1 ..            48       channels of the latent, and of the velocity
+ *   dit.mask           0 ..            4        mask channels beside the known video: frames in a latent frame; 0: the
+ *                                               input is the noisy latent alone, as in models without known video
+ *   dit.patch          1 ..            2        latent rows and columns in a token; always one frame
+ *   dit.frequencies    even            256      numbers that encode the time
+ *   dit.text_width     1 ..            4096     features of a text token
+ *   dit.text_keys      0 ..            512      keys that cross-attention sees: shorter texts are filled up with zeros
+ *   dit.eps            > 0             1e-6     of every norm
+ *
+ *   adapter.rays       0 ..            24       packed ray channels; 0 with no geometry: there is no adapter
+ *   adapter.geometry   0 ..            0        N: geometry channels after them
+ *   adapter.unshuffle  1 ..            16       r: a token sees 2 r x 2 r pixels
+ *   adapter.blocks     0 .. 8          1        residual blocks; the public weights have 1, the paper's count fits 2
+ *   adapter.widen      copy | fresh    copy     what becomes of weights for fewer channels: copied, with zeros for the
+ *                                               new ones, so that nothing changes at first; or made anew
+ *
+ *   lora.rank          0 ..            0        0: none
+ *   lora.alpha         > 0             rank     the low-rank term counts alpha / rank times
+ *   lora.targets       list of names   all ten  self_attn.q .k .v .o, cross_attn.q .k .v .o, ffn.0, ffn.2
+ */
+#ifndef DAR_MODELS_CONFIG_H
+#define DAR_MODELS_CONFIG_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "lib/json.h"
+#include "lib/status.h"
+
+/* The products of a block that carry weights, in the order of the tables below. */
+typedef enum dar_projection {
+    DAR_SELF_Q,
+    DAR_SELF_K,
+    DAR_SELF_V,
+    DAR_SELF_O,
+    DAR_CROSS_Q,
+    DAR_CROSS_K,
+    DAR_CROSS_V,
+    DAR_CROSS_O,
+    DAR_FFN_UP,
+    DAR_FFN_DOWN,
+    DAR_PROJECTIONS
+} dar_projection;
+
+extern const char *const dar_projection_names[DAR_PROJECTIONS + 1]; /* "self_attn.q", ..., NULL */
+
+#define DAR_PROJECTIONS_ALL ((1u << DAR_PROJECTIONS) - 1)
+
+typedef struct dar_dit_config {
+    int64_t width, heads, layers, ffn;
+    int64_t latent, mask, patch;
+    int64_t frequencies, text_width, text_keys;
+    double eps;
+} dar_dit_config;
+
+#define DAR_ADAPTER_BLOCKS 8
+
+typedef enum dar_widen { DAR_WIDEN_COPY, DAR_WIDEN_FRESH } dar_widen;
+
+typedef struct dar_adapter_config {
+    int64_t rays, geometry, unshuffle, blocks;
+    dar_widen widen;
+} dar_adapter_config;
+
+typedef struct dar_lora_config {
+    int64_t rank;
+    double alpha;
+    unsigned targets; /* bits 1 << dar_projection */
+} dar_lora_config;
+
+typedef struct dar_config {
+    char name[64];
+    dar_dit_config dit;
+    dar_adapter_config adapter;
+    dar_lora_config lora;
+} dar_config;
+
+/* Read the keys above from an object.  What is wrong, a key nobody knows included, is told by dar_json_finish. */
+void dar_config_read(dar_config *c, dar_json j);
+
+/* Read a file that holds nothing else.  On failure *c is undefined. */
+dar_status dar_config_open(dar_config *c, const char *path, dar_err *e);
+
+/* Channels of the patch embedding: noisy latent, mask, known latent. */
+int64_t dar_dit_channels(const dar_dit_config *c);
+
+#endif
