@@ -1,0 +1,181 @@
+/* lora_file.c: names of low-rank additions in files; reading and writing them. */
+#include "models/lora.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "lib/safetensors_write.h"
+
+/* ---------------------------------------------------------------- names */
+
+/* x if s begins with what, '.' and '_' counting as one; else NULL. */
+static const char *after(const char *s, const char *what)
+{
+    for (; *what; s++, what++) {
+        bool dots = (*s == '.' || *s == '_') && (*what == '.' || *what == '_');
+        if (*s != *what && !dots) return NULL;
+    }
+    return s;
+}
+
+static const char *skip_prefixes(const char *s)
+{
+    static const char *const prefix[] = { "lora_unet__", "diffusion_model.", "pipe.dit.", "transformer.",
+                                          "base_model.model." };
+    for (size_t i = 0; i < DAR_COUNT(prefix); i++) {
+        size_t n = strlen(prefix[i]);
+        if (!strncmp(s, prefix[i], n)) return skip_prefixes(s + n);
+    }
+    return s;
+}
+
+bool dar_lora_parse(dar_lora_key *k, const char *name, int64_t layers)
+{
+    static const struct {
+        const char *text;
+        dar_lora_part part;
+    } suffix[] = {
+        { ".lora_down.weight", DAR_LORA_DOWN },
+        { ".lora_up.weight", DAR_LORA_UP },
+        { ".lora_A.weight", DAR_LORA_DOWN },
+        { ".lora_B.weight", DAR_LORA_UP },
+        { ".lora_A.default.weight", DAR_LORA_DOWN },
+        { ".lora_B.default.weight", DAR_LORA_UP },
+        { ".alpha", DAR_LORA_ALPHA },
+    };
+    const char *s = after(skip_prefixes(name), "blocks.");
+    char *end;
+
+    if (!s || *s < '0' || *s > '9') return false;
+    k->block = strtol(s, &end, 10);
+    if (k->block >= layers || (*end != '.' && *end != '_')) return false;
+    for (int i = 0; i < DAR_PROJECTIONS; i++) {
+        const char *rest = after(end + 1, dar_projection_names[i]);
+        if (!rest) continue;
+        for (size_t j = 0; j < DAR_COUNT(suffix); j++) {
+            if (strcmp(rest, suffix[j].text) != 0) continue;
+            k->projection = (dar_projection)i;
+            k->part = suffix[j].part;
+            return true;
+        }
+    }
+    return false;
+}
+
+void dar_lora_module(char *name, size_t size, int64_t block, dar_projection which)
+{
+    snprintf(name, size, "lora_unet__blocks_%lld_%s", (long long)block, dar_projection_names[which]);
+    for (char *c = name; *c; c++)
+        if (*c == '.') *c = '_';
+}
+
+/* ---------------------------------------------------------------- reading */
+
+/* What a file says about one product. */
+struct found {
+    const char *name[3]; /* by part; NULL: nothing */
+};
+
+static dar_status collect(struct found *found, int64_t layers, dar_safetensors *f, dar_err *e)
+{
+    for (size_t i = 0; i < dar_safetensors_count(f); i++) {
+        const dar_safetensors_entry *x = dar_safetensors_at(f, i);
+        dar_lora_key k;
+        if (!dar_lora_parse(&k, x->name, layers))
+            return dar_fail(e, DAR_ERR_FORMAT,
+                            "%s: %s: expected the low-rank addition of a product of blocks 0 to %lld", x->file, x->name,
+                            (long long)layers - 1);
+        const char **name = &found[k.block * DAR_PROJECTIONS + k.projection].name[k.part];
+        if (*name) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s and %s mean the same", x->file, *name, x->name);
+        *name = x->name;
+    }
+    return DAR_OK;
+}
+
+static dar_status wrong_shape(const char *name, const dar_tensor *x, dar_shape want, dar_err *e)
+{
+    char found[96], expected[96];
+    return dar_fail(e, DAR_ERR_FORMAT, "%s: found %s, expected %s", name,
+                    dar_shape_text(&x->shape, found, sizeof found), dar_shape_text(&want, expected, sizeof expected));
+}
+
+static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const struct found *in, dar_safetensors *f,
+                               const dar_lora_read_options *o, dar_err *e)
+{
+    int64_t block = index / DAR_PROJECTIONS;
+    dar_projection which = (dar_projection)(index % DAR_PROJECTIONS);
+    dar_dit_product *q = &m->block[block].product[which];
+    const int64_t *d = q->w->x.shape.d; /* out, in */
+    const char *const *name = in->name;
+    dar_tensor down, up, alpha;
+
+    if (!name[DAR_LORA_DOWN] || !name[DAR_LORA_UP])
+        return dar_fail(e, DAR_ERR_FORMAT, "%s: found %s alone, expected both factors", dar_safetensors_at(f, 0)->file,
+                        name[0]   ? name[0]
+                        : name[1] ? name[1]
+                                  : name[2]);
+    DAR_TRY(dar_safetensors_tensor(f, name[DAR_LORA_DOWN], &down, e));
+    DAR_TRY(dar_safetensors_tensor(f, name[DAR_LORA_UP], &up, e));
+    int64_t rank = q->down ? q->down->x.shape.d[0] : down.shape.d[0];
+    dar_shape want[] = { DAR_SHAPE(rank, d[1]), DAR_SHAPE(d[0], rank) };
+    if (!dar_shape_equal(&down.shape, &want[0])) return wrong_shape(name[DAR_LORA_DOWN], &down, want[0], e);
+    if (!dar_shape_equal(&up.shape, &want[1])) return wrong_shape(name[DAR_LORA_UP], &up, want[1], e);
+
+    double a = o->alpha > 0 ? o->alpha : (double)rank;
+    if (name[DAR_LORA_ALPHA]) {
+        DAR_TRY(dar_safetensors_tensor(f, name[DAR_LORA_ALPHA], &alpha, e));
+        if (dar_tensor_count(&alpha) != 1) return wrong_shape(name[DAR_LORA_ALPHA], &alpha, (dar_shape){ 0 }, e);
+        a = dar_dtype_get(alpha.dtype, alpha.data, 0);
+    }
+    if (!q->down) dar_lora_declare(m, p, block, which, rank);
+    q->scale = o->strength * a / (double)rank;
+    dar_param_bind(p, q->down, &down);
+    dar_param_bind(p, q->up, &up);
+    return DAR_OK;
+}
+
+dar_status dar_lora_read(dar_dit *m, dar_params *p, dar_safetensors *f, const dar_lora_read_options *o, dar_err *e)
+{
+    int64_t n = m->c.layers * DAR_PROJECTIONS;
+    struct found *found = calloc((size_t)n, sizeof *found);
+    dar_status s = found ? collect(found, m->c.layers, f, e) : dar_fail(e, DAR_ERR_NOMEM, "lora: out of memory");
+
+    for (int64_t i = 0; s == DAR_OK && i < n; i++)
+        if (found[i].name[0] || found[i].name[1] || found[i].name[2]) s = read_product(m, p, i, &found[i], f, o, e);
+    free(found);
+    return s;
+}
+
+/* ---------------------------------------------------------------- writing */
+
+struct written {
+    char name[DAR_PARAM_NAME];
+    float alpha;
+};
+
+dar_status dar_lora_write(const dar_dit *m, const char *path, dar_err *e)
+{
+    size_t n = 0, most = (size_t)m->c.layers * DAR_PROJECTIONS;
+    dar_safetensors_item *item = calloc(3 * most, sizeof *item);
+    struct written *alpha = calloc(most, sizeof *alpha);
+    const char *const meta[] = { "format", "pt", NULL };
+    char module[DAR_PARAM_NAME - sizeof ".alpha"];
+    dar_status s;
+
+    for (size_t i = 0; item && alpha && i < most; i++) {
+        const dar_dit_product *q = &m->block[i / DAR_PROJECTIONS].product[i % DAR_PROJECTIONS];
+        if (!q->down) continue;
+        dar_lora_module(module, sizeof module, (int64_t)(i / DAR_PROJECTIONS), (dar_projection)(i % DAR_PROJECTIONS));
+        snprintf(alpha[i].name, sizeof alpha[i].name, "%s.alpha", module);
+        alpha[i].alpha = (float)(q->scale * (double)q->down->x.shape.d[0]);
+        item[n++] = (dar_safetensors_item){ q->down->name, q->down->x };
+        item[n++] = (dar_safetensors_item){ q->up->name, q->up->x };
+        item[n++] = (dar_safetensors_item){ alpha[i].name, dar_tensor_of(DAR_F32, (dar_shape){ 0 }, &alpha[i].alpha) };
+    }
+    if (!item || !alpha) s = dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
+    else s = dar_safetensors_write(path, item, n, &(dar_safetensors_options){ .meta = meta }, e);
+    free(item);
+    free(alpha);
+    return s;
+}
