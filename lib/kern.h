@@ -56,6 +56,11 @@ typedef void dar_kern_map_back(size_t n, const void *x, const void *gy, void *gx
 typedef struct dar_kern {
     const char *name; /* of the fastest set used: "ref", "avx2", "avx512" */
 
+    /* Bits, whatever they mean; the same in both tables.  transpose, by stored type (i8 is NULL): y[j ldy + i] =
+     * x[i ldx + j] for i < m, j < n.  stream: copy past the caches, at any alignment. */
+    void (*transpose[DAR_DTYPES])(size_t m, size_t n, const void *x, size_t ldx, void *y, size_t ldy);
+    void (*stream)(size_t bytes, const void *x, void *y);
+
     /* From and to storage, by stored type (i8 is NULL).  To 16 bits: nearest even, NaN stays NaN.  stream: write past
      * the caches. */
     void (*get[DAR_DTYPES])(size_t n, const void *src, void *x);

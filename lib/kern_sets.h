@@ -19,4 +19,8 @@ void dar_kern_ref_f64(dar_kern *k);
 void dar_kern_avx2(dar_kern *f32); /* replace f32 slots; do nothing where the compiler has no such instructions */
 void dar_kern_avx512(dar_kern *f32);
 
+void dar_kern_move_ref(dar_kern *k); /* transpose and stream */
+void dar_kern_move_avx2(dar_kern *k);
+void dar_kern_move_avx512(dar_kern *k);
+
 #endif

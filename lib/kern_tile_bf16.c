@@ -70,12 +70,6 @@ ALONG(along_f16, 2, get_f16)
 ROWS(f32_rows, 4, along_f32)
 ROWS(f16_rows, 2, along_f16)
 
-/* Rows k and k + 1 (or one alone) interleaved. */
-static inline units pairs(__m256i low, __m256i high)
-{
-    return _mm512_or_si512(_mm512_cvtepu16_epi32(low), _mm512_slli_epi32(_mm512_cvtepu16_epi32(high), 16));
-}
-
 static inline __m256i row_bf16(const void *p, size_t n)
 {
     return _mm256_maskz_loadu_epi16(first(n), p);
@@ -91,6 +85,7 @@ static inline __m256i row_f16(const void *p, size_t n)
     return (__m256i)_mm512_cvtneps_pbh(get_f16(p, n));
 }
 
+/* Rows k and k + 1 (or one alone) interleaved. */
 #define ACROSS(NAME, ROW)                                                                                              \
     static inline units NAME(const void *p, size_t ld, size_t rows, size_t n)                                          \
     {                                                                                                                  \

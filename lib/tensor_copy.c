@@ -1,7 +1,7 @@
 /* tensor_copy.c: copies and sums between any strides and types.
  *
  * Dimensions that are one run of memory in both tensors are merged.  What is left is walked along the dimension in
- * which dst is dense.  Where src is dense in another one, the two are cut in square tiles that are read along one and
+ * which dst is dense, the row.  Where src is dense in another one, the two are cut in tiles that are read along one and
  * written along the other, so that a permutation runs at the speed of memory too. */
 #include "lib/tensor.h"
 
@@ -11,9 +11,12 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define CHUNK     65536 /* elements per task */
-#define TILE      64    /* rows and columns of a tile: whole cache lines of any type */
-#define MAX_WIDTH 8     /* bytes of an element */
+#define CHUNK       65536 /* elements per task, about */
+#define TILE_ROW    512   /* bytes of the row in a tile */
+#define TILE_ACROSS 256   /* elements of the other dimension: long runs in memory, and the second-level cache holds it \
+                           */
+#define MAX_WIDTH 8       /* bytes of an element */
+#define AHEAD     4096    /* bytes asked for before they are read, where shorter runs end unforeseen */
 
 struct dim {
     size_t n;
@@ -22,10 +25,18 @@ struct dim {
 
 struct walk {
     const dar_tensor *dst, *src;
-    bool add;
-    int outer;                        /* dimensions stepped through: dim[0] to dim[outer - 1] */
-    struct dim dim[DAR_MAX_DIMS + 2]; /* then the row, then, in tiles, the one in which src is dense */
-    size_t pieces, piece;             /* of a row, and their length */
+    dar_put mode;
+    bool tiles;
+    struct dim row, other; /* other: in which src is dense; without tiles 1 */
+    size_t m, n;           /* of a part: elements of the row by elements of the other dimension */
+    int steps;             /* from part to part: the dimensions that are left, then parts of the other, of the row */
+    struct dim step[DAR_MAX_DIMS + 2];
+};
+
+/* What is moved at once: offsets of its first element, and how many steps it is from the first part. */
+struct part {
+    int64_t dst, src;
+    size_t at[DAR_MAX_DIMS + 2];
 };
 
 static char *address(const dar_tensor *x, int64_t element)
@@ -33,16 +44,45 @@ static char *address(const dar_tensor *x, int64_t element)
     return (char *)x->data + element * (int64_t)dar_dtype_size(x->dtype);
 }
 
-/* Offsets of the i-th combination of the outer dimensions. */
-static void offsets(const struct walk *w, size_t i, int64_t *dst, int64_t *src)
+static struct part part_of(const struct walk *w, size_t i)
 {
-    *dst = *src = 0;
-    for (int k = w->outer - 1; k >= 0; k--) {
-        int64_t at = (int64_t)(i % w->dim[k].n);
-        i /= w->dim[k].n;
-        *dst += at * w->dim[k].dst;
-        *src += at * w->dim[k].src;
+    struct part p = { 0 };
+    for (int k = w->steps - 1; k >= 0; i /= w->step[k--].n) {
+        p.at[k] = i % w->step[k].n;
+        p.dst += (int64_t)p.at[k] * w->step[k].dst;
+        p.src += (int64_t)p.at[k] * w->step[k].src;
     }
+    return p;
+}
+
+/* The next part, without a division. */
+static void advance(const struct walk *w, struct part *p)
+{
+    for (int k = w->steps - 1; k >= 0; k--) {
+        const struct dim *step = &w->step[k];
+        p->dst += step->dst;
+        p->src += step->src;
+        if (++p->at[k] < step->n) return;
+        p->dst -= (int64_t)step->n * step->dst;
+        p->src -= (int64_t)step->n * step->src;
+        p->at[k] = 0;
+    }
+}
+
+static size_t rest(size_t all, size_t part, size_t at)
+{
+    return all - at * part < part ? all - at * part : part;
+}
+
+/* Size of a part. */
+static size_t part_m(const struct walk *w, const struct part *p)
+{
+    return rest(w->row.n, w->m, p->at[w->steps - 1]);
+}
+
+static size_t part_n(const struct walk *w, const struct part *p)
+{
+    return rest(w->other.n, w->n, p->at[w->steps - 2]);
 }
 
 /* ---------------------------------------------------------------- elements, whatever they mean */
@@ -58,110 +98,92 @@ static void move(size_t size, size_t n, const void *x, int64_t x_step, void *y, 
 #undef MOVE
 }
 
-/* y[j][i] = x[i][j] in tiles of `size` bytes. */
-static void transpose(size_t size, const void *x, void *y)
-{
-#define TRANSPOSE(T)                                                                                                   \
-    for (size_t j = 0; j < TILE; j++)                                                                                  \
-        for (size_t i = 0; i < TILE; i++) ((T *)y)[j * TILE + i] = ((const T *)x)[i * TILE + j]
-    if (size == 2) TRANSPOSE(uint16_t);
-    else if (size == 4) TRANSPOSE(uint32_t);
-    else TRANSPOSE(uint64_t);
-#undef TRANSPOSE
-}
-
 /* ---------------------------------------------------------------- rows */
 
 /* n consecutive elements of `type` to or onto n consecutive ones of dst. */
-static void put_row(const struct walk *w, char *to, dar_dtype type, const char *from, size_t n)
+static void put_row(const struct walk *w, dar_put mode, char *to, dar_dtype type, const char *from, size_t n)
 {
-    dar_dtype c = dar_compute_type(w->dst->dtype);
+    bool wide = type == DAR_F64 || type == DAR_F32;
+    dar_dtype c = mode != DAR_PUT_ADD && wide ? type : dar_compute_type(w->dst->dtype);
     double buf[DAR_PIECE];
 
-    if (!w->add) {
+    if (mode == DAR_PUT) {
         dar_row_convert(w->dst->dtype, to, type, from, n);
+        return;
+    }
+    if (mode == DAR_PUT_STREAM && type == w->dst->dtype) {
+        dar_kern_for(DAR_F32)->stream(n * dar_dtype_size(type), from, to);
         return;
     }
     for (size_t i = 0; i < n; i += DAR_PIECE) {
         size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
         const void *x = dar_row_get(c, type, from + i * dar_dtype_size(type), m, buf);
-        dar_row_put(c, x, w->dst->dtype, to + i * dar_dtype_size(w->dst->dtype), m, DAR_PUT_ADD);
+        dar_row_put(c, x, w->dst->dtype, to + i * dar_dtype_size(w->dst->dtype), m, mode);
     }
 }
 
 /* A piece of a row whose elements may lie apart in either tensor. */
 static void put_apart(const struct walk *w, int64_t dst, int64_t src, size_t n)
 {
-    const struct dim *row = &w->dim[w->outer];
     size_t ds = dar_dtype_size(w->dst->dtype), ss = dar_dtype_size(w->src->dtype);
     char from[DAR_PIECE * MAX_WIDTH], to[DAR_PIECE * MAX_WIDTH];
 
     for (size_t i = 0; i < n; i += DAR_PIECE) {
         size_t m = n - i < DAR_PIECE ? n - i : DAR_PIECE;
-        char *at = address(w->dst, dst + (int64_t)i * row->dst);
-        move(ss, m, address(w->src, src + (int64_t)i * row->src), row->src, from, 1);
-        if (w->add) move(ds, m, at, row->dst, to, 1);
-        put_row(w, to, w->src->dtype, from, m);
-        move(ds, m, to, 1, at, row->dst);
+        char *at = address(w->dst, dst + (int64_t)i * w->row.dst);
+        move(ss, m, address(w->src, src + (int64_t)i * w->row.src), w->row.src, from, 1);
+        if (w->mode == DAR_PUT_ADD) move(ds, m, at, w->row.dst, to, 1);
+        put_row(w, w->mode == DAR_PUT_ADD ? DAR_PUT_ADD : DAR_PUT, to, w->src->dtype, from, m);
+        move(ds, m, to, 1, at, w->row.dst);
     }
 }
 
-static void put_piece(const struct walk *w, size_t i)
+/* A part of one row. */
+static void put_piece(const struct walk *w, const struct part *p)
 {
-    const struct dim *row = &w->dim[w->outer];
-    size_t first = i % w->pieces * w->piece, n = row->n - first < w->piece ? row->n - first : w->piece;
-    int64_t dst, src;
-    offsets(w, i / w->pieces, &dst, &src);
-    dst += (int64_t)first * row->dst;
-    src += (int64_t)first * row->src;
-    if (row->dst == 1 && row->src == 1) put_row(w, address(w->dst, dst), w->src->dtype, address(w->src, src), n);
-    else put_apart(w, dst, src, n);
+    size_t m = part_m(w, p);
+    if (w->row.dst != 1 || w->row.src != 1) put_apart(w, p->dst, p->src, m);
+    else put_row(w, w->mode, address(w->dst, p->dst), w->src->dtype, address(w->src, p->src), m);
 }
 
-/* ---------------------------------------------------------------- tiles */
-
-/* One tile: m elements of the row (dst is dense) by n of the other dimension (src is dense). */
-static void put_tile(const struct walk *w, int64_t dst, int64_t src, size_t m, size_t n)
+/* A part of both dimensions. */
+static void put_tile(const struct walk *w, const struct part *p)
 {
-    const struct dim *row = &w->dim[w->outer], *other = row + 1;
-    dar_dtype type = w->add ? dar_compute_type(w->dst->dtype) : w->dst->dtype;
-    size_t size = dar_dtype_size(type);
-    _Alignas(64) char x[TILE * TILE * MAX_WIDTH], y[TILE * TILE * MAX_WIDTH];
+    dar_dtype type = w->src->dtype;
+    size_t size = dar_dtype_size(type), m = part_m(w, p), n = part_n(w, p), ld = TILE_ROW / size;
+    _Alignas(64) char y[TILE_ROW * TILE_ACROSS];
 
-    for (size_t i = 0; i < m; i++)
-        dar_row_convert(type, x + i * TILE * size, w->src->dtype, address(w->src, src + (int64_t)i * row->src), n);
-    transpose(size, x, y);
+    dar_kern_for(DAR_F32)->transpose[type](m, n, address(w->src, p->src), (size_t)w->row.src, y, ld);
     for (size_t j = 0; j < n; j++)
-        put_row(w, address(w->dst, dst + (int64_t)j * other->dst), type, y + j * TILE * size, m);
+        put_row(w, w->mode, address(w->dst, p->dst + (int64_t)j * w->other.dst), type, y + j * ld * size, m);
 }
 
-/* A stripe of tiles. */
-static void put_stripe(const struct walk *w, size_t i)
+static void ask(const struct walk *w, const struct part *p)
 {
-    const struct dim *row = &w->dim[w->outer], *other = row + 1;
-    size_t across = (other->n + TILE - 1) / TILE, first = i % w->pieces * w->piece, j = i / w->pieces % across * TILE;
-    size_t end = row->n - first < w->piece ? row->n : first + w->piece, n = other->n - j < TILE ? other->n - j : TILE;
-    int64_t dst, src;
-    offsets(w, i / w->pieces / across, &dst, &src);
-    dst += (int64_t)j * other->dst;
-    src += (int64_t)j * other->src;
-    for (size_t k = first; k < end; k += TILE)
-        put_tile(w, dst + (int64_t)k * row->dst, src + (int64_t)k * row->src, end - k < TILE ? end - k : TILE, n);
+    size_t size = dar_dtype_size(w->src->dtype), m = part_m(w, p), n = part_n(w, p);
+    if (!w->tiles) dar_row_ahead(address(w->src, p->src), m * size);
+    for (size_t i = 0; w->tiles && i < m; i++)
+        dar_row_ahead(address(w->src, p->src + (int64_t)i * w->row.src), n * size);
+}
+
+static void parts(void *ctx, size_t begin, size_t end, int thread)
+{
+    const struct walk *w = ctx;
+    size_t bytes = w->m * w->n * dar_dtype_size(w->src->dtype);
+    size_t ahead = (w->tiles || w->row.src == 1) && bytes < AHEAD ? AHEAD / bytes : end;
+    struct part p = part_of(w, begin), later = part_of(w, begin + ahead);
+    (void)thread;
+    for (size_t i = begin; i < end; i++, advance(w, &p)) {
+        if (i + ahead < end) {
+            ask(w, &later);
+            advance(w, &later);
+        }
+        if (w->tiles) put_tile(w, &p);
+        else put_piece(w, &p);
+    }
 }
 
 /* ---------------------------------------------------------------- the plan */
-
-static void pieces(void *ctx, size_t begin, size_t end, int thread)
-{
-    (void)thread;
-    for (size_t i = begin; i < end; i++) put_piece(ctx, i);
-}
-
-static void stripes(void *ctx, size_t begin, size_t end, int thread)
-{
-    (void)thread;
-    for (size_t i = begin; i < end; i++) put_stripe(ctx, i);
-}
 
 /* The dimensions longer than 1, neighbours merged where both tensors run through them. */
 static int merged_dims(const dar_tensor *dst, const dar_tensor *src, struct dim *dim)
@@ -183,12 +205,26 @@ static int merged_dims(const dar_tensor *dst, const dar_tensor *src, struct dim 
     return n;
 }
 
-/* Move dim[i] to place `to`, keeping the order of the others. */
-static void move_dim(struct dim *dim, int i, int to)
+static struct dim take(struct dim *dim, int *n, int i)
 {
     struct dim d = dim[i];
-    for (; i < to; i++) dim[i] = dim[i + 1];
-    dim[to] = d;
+    for (--*n; i < *n; i++) dim[i] = dim[i + 1];
+    return d;
+}
+
+/* Cut row and other dimension in parts, and move them. */
+static void move_parts(struct walk *w)
+{
+    size_t m = w->tiles ? TILE_ROW / dar_dtype_size(w->src->dtype) : CHUNK, count = 1;
+
+    w->m = w->row.n < m ? w->row.n : m;
+    w->n = w->other.n < TILE_ACROSS ? w->other.n : TILE_ACROSS;
+    w->step[w->steps++] =
+        (struct dim){ (w->other.n + w->n - 1) / w->n, (int64_t)w->n * w->other.dst, (int64_t)w->n * w->other.src };
+    w->step[w->steps++] =
+        (struct dim){ (w->row.n + w->m - 1) / w->m, (int64_t)w->m * w->row.dst, (int64_t)w->m * w->row.src };
+    for (int i = 0; i < w->steps; i++) count *= w->step[i].n;
+    dar_parallel_range(count, (CHUNK + w->m * w->n - 1) / (w->m * w->n), parts, w);
 }
 
 static void put(const dar_tensor *dst, const dar_tensor *src, bool add)
@@ -199,28 +235,17 @@ static void put(const dar_tensor *dst, const dar_tensor *src, bool add)
     DAR_ASSERT(dst->dtype != DAR_I8 && src->dtype != DAR_I8, "copy: i8 rows are quantised, not copied");
     if (!dar_tensor_count(dst)) return;
 
-    struct walk w = { .dst = dst, .src = src, .add = add };
-    int n = merged_dims(dst, src, w.dim), dense = -1, row = n - 1;
+    struct walk w = { .dst = dst, .src = src, .mode = dar_put_for(dar_tensor_bytes(dst), add) };
+    int n = merged_dims(dst, src, w.step), row = n - 1, dense = -1;
     for (int i = 0; i < n; i++)
-        if (w.dim[i].dst == 1) row = i;
+        if (w.step[i].dst == 1) row = i;
     for (int i = 0; i < n; i++)
-        if (w.dim[i].src == 1) dense = i;
-    bool tiles = dense >= 0 && dense != row && w.dim[row].dst == 1;
-    size_t parts = 1, length = w.dim[row].n;
-    move_dim(w.dim, row, n - 1);
-    if (tiles) {
-        move_dim(w.dim, dense > row ? dense - 1 : dense, n - 2);
-        struct dim other = w.dim[n - 2];
-        w.dim[n - 2] = w.dim[n - 1];
-        w.dim[n - 1] = other;
-        parts = (other.n + TILE - 1) / TILE;
-    }
-    w.outer = n - (tiles ? 2 : 1);
-    w.piece = tiles ? CHUNK / TILE : CHUNK;
-    w.pieces = (length + w.piece - 1) / w.piece;
-    parts *= w.pieces;
-    for (int i = 0; i < w.outer; i++) parts *= w.dim[i].n;
-    dar_parallel_range(parts, w.piece / (length < w.piece ? length : w.piece), tiles ? stripes : pieces, &w);
+        if (w.step[i].src == 1) dense = i;
+    w.tiles = dense >= 0 && dense != row && w.step[row].dst == 1;
+    w.row = take(w.step, &n, row);
+    w.other = w.tiles ? take(w.step, &n, dense > row ? dense - 1 : dense) : (struct dim){ 1, 0, 0 };
+    w.steps = n;
+    move_parts(&w);
 }
 
 void dar_tensor_copy(const dar_tensor *dst, const dar_tensor *src)

@@ -74,6 +74,12 @@ static dar_val *call_mean(dar_tape *t, dar_val *const *x, const int64_t *s)
     return dar_mean(t, x[0], DAR_ALL_DIMS, false);
 }
 
+static dar_val *call_sum(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_sum(t, x[0], 1, false); /* as the gradient of a bias */
+}
+
 static void prediction_target(bench *b)
 {
     one(b);
@@ -88,6 +94,7 @@ static dar_val *call_squared_error(dar_tape *t, dar_val *const *x, const int64_t
 
 static const bench_kind softmax = { BENCH_OP(softmax), .inputs = one, .call = call_softmax };
 static const bench_kind mean = { BENCH_OP(mean), .inputs = one, .call = call_mean };
+static const bench_kind sum = { BENCH_OP(sum), .inputs = one, .call = call_sum };
 static const bench_kind squared_error = { BENCH_OP(squared_error), .inputs = prediction_target,
                                           .call = call_squared_error };
 
@@ -217,6 +224,58 @@ static const bench_kind transpose = { .part = { "transpose" },
                                       .inputs = one,
                                       .call = call_transpose };
 
+/* Channels of two clips, frames, height, width: skip connections, and what the condition is made of. */
+static void two_clips(bench *b)
+{
+    for (int i = 0; i < 2; i++) bench_input(b, b->row->type, DAR_SHAPE(1, b->s[i], b->s[2], b->s[3], b->s[4]), true);
+}
+
+static dar_val *call_concat(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    (void)s;
+    return dar_concat(t, x, 2, 1);
+}
+
+static const bench_kind concat = { BENCH_OP(concat), .inputs = two_clips, .call = call_concat };
+
+/* ---------------------------------------------------------------- pixels and frames to channels and back: channels,
+ * frames, height, width of x; then the factor in space, or channels of y and the factor in time beside 2 in space */
+
+static void one_clip(bench *b)
+{
+    bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1], b->s[2], b->s[3]), true);
+}
+
+static dar_val *call_unshuffle(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    return dar_pixel_unshuffle(t, x[0], (int)s[4], DAR_PIXELS_ROWS);
+}
+
+static dar_val *call_patchify(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    return dar_pixel_unshuffle(t, x[0], (int)s[4], DAR_PIXELS_COLUMNS);
+}
+
+static dar_val *call_avg_down(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    return dar_avg_down(t, x[0], s[4], (int)s[5], 2);
+}
+
+static dar_val *call_dup_up(dar_tape *t, dar_val *const *x, const int64_t *s)
+{
+    return dar_dup_up(t, x[0], s[4], (int)s[5], 2, 0);
+}
+
+#define RESAMPLE(name, of)                                                                                             \
+    {                                                                                                                  \
+        .part = { #name, #name "_back" }, .setup = bench_op_setup, .run = { bench_op_forward, bench_op_backward },     \
+        .reset = bench_op_reset, .op = &dar_op_##of, .inputs = one_clip, .call = call_##name                           \
+    }
+static const bench_kind unshuffle = RESAMPLE(unshuffle, resample_down);
+static const bench_kind patchify = RESAMPLE(patchify, resample_down);
+static const bench_kind avg_down = RESAMPLE(avg_down, resample_down);
+static const bench_kind dup_up = RESAMPLE(dup_up, resample_up);
+
 /* ---------------------------------------------------------------- linear layers: tokens, outputs, inputs, rank */
 
 static void layer(bench *b)
@@ -345,8 +404,19 @@ const bench_row bench_op_rows[] = {
     PLAIN(affine, 8192, 3072),
     PLAIN(softmax, 8192, 3072),
     PLAIN(mean, 8192, 3072),
+    PLAIN(sum, 8192, 3072),
     PLAIN(squared_error, 8192, 3072),
     PLAIN(permute, 8192, 24, 128),
     PLAIN(transpose, 8192, 3072),
+    PLAIN(concat, 128, 128, 4, 128, 224),
+
+    PLAIN(unshuffle, 24, 4, 512, 896, 16), /* adapter */
+    PLAIN(unshuffle, 24, 4, 512, 896, 8),
+    PLAIN(patchify, 3, 17, 512, 896, 2),       /* VAE encoder */
+    PLAIN(avg_down, 160, 4, 256, 448, 320, 1), /* VAE encoder, first stage */
+    PLAIN(avg_down, 320, 4, 128, 224, 640, 2), /* second */
+    PLAIN(avg_down, 640, 4, 64, 112, 640, 2),  /* third */
+    PLAIN(dup_up, 1024, 4, 32, 56, 1024, 2),   /* VAE decoder, first and second stage */
+    PLAIN(dup_up, 1024, 4, 64, 112, 512, 1),   /* third */
 };
 const size_t bench_n_op_rows = DAR_COUNT(bench_op_rows);

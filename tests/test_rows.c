@@ -3,6 +3,7 @@
 #include "tests/test.h"
 
 #include "autograd/ops.h"
+#include "lib/cpu.h"
 #include "lib/kern.h"
 
 static dar_arena arena;
@@ -65,11 +66,50 @@ static void copies_of_all_layouts(void **state)
     static const int orders[][3] = { { 0, 1, 2 }, { 0, 2, 1 }, { 1, 0, 2 }, { 1, 2, 0 }, { 2, 0, 1 }, { 2, 1, 0 } };
     static const int64_t sizes[][3] = { { 3, 5, 7 }, { 1, 70, 66 }, { 65, 1, 130 }, { 2, 3, 2100 }, { 2050, 2, 1 } };
     static const dar_dtype types[] = { DAR_F64, DAR_F32, DAR_BF16, DAR_F16 };
-    for (size_t s = 0; s < DAR_COUNT(sizes); s++)
-        for (size_t o = 0; o < DAR_COUNT(orders); o++)
-            for (size_t t = 0; t < DAR_COUNT(types); t++)
-                for (size_t f = 0; f < DAR_COUNT(types); f++)
-                    for (int add = 0; add < 2; add++) check_copy(types[t], types[f], sizes[s], orders[o], add);
+    unsigned level[5];
+    for (int l = 0, n = test_levels(level); l < n; l++) {
+        dar_cpu_init(level[l]);
+        for (size_t s = 0; s < DAR_COUNT(sizes); s++)
+            for (size_t o = 0; o < DAR_COUNT(orders); o++)
+                for (size_t t = 0; t < DAR_COUNT(types); t++)
+                    for (size_t f = 0; f < DAR_COUNT(types); f++)
+                        for (int add = 0; add < 2; add++) check_copy(types[t], types[f], sizes[s], orders[o], add);
+    }
+    dar_cpu_init(DAR_CPU_ALL);
+}
+
+/* Too large for the caches, so stored past them: rows at every alignment, every bit pattern, NaN of every kind among
+ * them. */
+static void large_copies(void **state)
+{
+    (void)state;
+    static const dar_dtype types[] = { DAR_F64, DAR_F32, DAR_BF16, DAR_F16 };
+    unsigned level[5];
+    for (int l = 0, levels = test_levels(level); l < levels; l++)
+        for (size_t t = 0; t < DAR_COUNT(types); t++) {
+            dar_mark mark = dar_arena_mark(&arena);
+            size_t size = dar_dtype_size(types[t]), rows = 4099, cols = ((size_t)25 << 20) / size / rows;
+            dar_tensor x = dar_tensor_push(&arena, types[t], DAR_SHAPE((int64_t)rows, (int64_t)cols));
+            dar_tensor whole = dar_tensor_push(&arena, types[t], DAR_SHAPE((int64_t)cols, (int64_t)rows + 2));
+            dar_tensor y = dar_tensor_narrow(&whole, 1, 1, (int64_t)rows);
+            dar_tensor z = dar_tensor_push(&arena, types[t], x.shape);
+            dar_tensor back = dar_tensor_permute(&y, (int[]){ 1, 0 });
+            uint16_t *bits = x.data;
+            for (size_t i = 0; i < dar_tensor_bytes(&x) / 2; i++) bits[i] = (uint16_t)(i * 40503 + i / 65536);
+            dar_cpu_init(level[l]);
+            dar_tensor flipped = dar_tensor_permute(&x, (int[]){ 1, 0 });
+            dar_tensor_copy(&y, &flipped);
+            for (size_t i = 0; i < rows; i += 61)
+                for (size_t j = 0; j < cols; j++)
+                    CHECK(memcmp(dar_tensor_at(&x, i * cols + j), dar_tensor_at(&whole, j * (rows + 2) + i + 1),
+                                 size) == 0,
+                          "%s at level %d: [%zu, %zu] has other bits", dar_dtype_name(types[t]), l, i, j);
+            dar_tensor_copy(&z, &back);
+            CHECK(memcmp(x.data, z.data, dar_tensor_bytes(&x)) == 0, "%s at level %d: not the same bits after two",
+                  dar_dtype_name(types[t]), l);
+            dar_arena_reset(&arena, mark);
+        }
+    dar_cpu_init(DAR_CPU_ALL);
 }
 
 static void fills(void **state)
@@ -161,7 +201,7 @@ static void zero_rows(void **state)
 static int setup(void **state)
 {
     (void)state;
-    return dar_arena_init(&arena, "test", (size_t)64 << 20, NULL) != DAR_OK ||
+    return dar_arena_init(&arena, "test", (size_t)96 << 20, NULL) != DAR_OK ||
            dar_tape_init(&tape, &arena, NULL) != DAR_OK;
 }
 
@@ -176,8 +216,12 @@ static int teardown(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(copies_of_all_layouts), cmocka_unit_test(fills),     cmocka_unit_test(positions),
-        cmocka_unit_test(norm_far_from_zero),    cmocka_unit_test(zero_rows),
+        cmocka_unit_test(copies_of_all_layouts),
+        cmocka_unit_test(large_copies),
+        cmocka_unit_test(fills),
+        cmocka_unit_test(positions),
+        cmocka_unit_test(norm_far_from_zero),
+        cmocka_unit_test(zero_rows),
     };
     return cmocka_run_group_tests(tests, setup, teardown) != 0;
 }
