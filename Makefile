@@ -34,7 +34,14 @@ isa     = $(if $(filter %_avx2,$1),$(AVX2)) $(if $(filter %_avx512,$1),$(AVX512)
 alias   = $(if $(filter-out fuzz,$(MODE)),$(if $(filter tests/fuzz_%,$1),-DLLVMFuzzerTestOneInput=$(notdir $1)))
 
 ROOMS := lib autograd autograd/ops models data
-SRC   := $(wildcard $(addsuffix /*.c,$(ROOMS)))
+
+# A program dar-NAME is ROOM/dar_NAME.c with its main, ROOM/dar_NAME_*.c and the library.
+HALLS    := data train infer
+MAINS    := $(wildcard $(addsuffix /dar_*.c,$(HALLS)))
+PROGRAMS := $(sort $(foreach m,$(MAINS),dar-$(word 2,$(subst _, ,$(basename $(notdir $m))))))
+parts     = $(patsubst %.c,$B/%.o,$(wildcard $(addsuffix /dar_$1.c,$(HALLS)) $(addsuffix /dar_$1_*.c,$(HALLS))))
+
+SRC   := $(filter-out $(MAINS),$(wildcard $(addsuffix /*.c,$(ROOMS))))
 OBJ   := $(SRC:%.c=$B/%.o)
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
 BENCH := $(patsubst %.c,$B/%.o,$(wildcard tests/bench_*.c))
@@ -42,10 +49,11 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
-.PHONY: all everything headers test test-built check lint stress bench-kernels ulp fuzz fuzz-run deps clean help FORCE
+.PHONY: all install everything headers test test-built check lint stress bench-kernels ulp fuzz fuzz-run deps clean
+.PHONY: help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
-all: $B/libdar.a ## build the library and the programs
+all: $B/libdar.a $(PROGRAMS:%=$B/%) ## build the library and the programs
 
 help: ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -69,6 +77,17 @@ $B/libdar.a: $(OBJ)
 	@rm -f $@
 	@ar rcs $@ $^
 
+$(foreach p,$(PROGRAMS),$(eval $B/$p: $(call parts,$(p:dar-%=%))))
+$(PROGRAMS:%=$B/%): $B/libdar.a
+	@echo "LD $@"
+	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS)
+
+PREFIX ?= /usr/local
+install: all ## copy the programs to PREFIX/bin, PREFIX=/usr/local
+	@install -d $(DESTDIR)$(PREFIX)/bin
+	@install -m 755 $(PROGRAMS:%=$B/%) $(DESTDIR)$(PREFIX)/bin
+	@echo "installed in $(DESTDIR)$(PREFIX)/bin: $(PROGRAMS)"
+
 -include $(wildcard $B/*/*.d $B/*/*/*.d)
 
 # ---------------------------------------------------------------- test
@@ -88,7 +107,7 @@ test: deps ## install what is missing, build, run every test; the last line coun
 	@$(MAKE) --no-print-directory test-built
 
 # Two tests want the real models that may lie beside the repository.
-test-built: $(TESTS:%=$B/%)
+test-built: $(TESTS:%=$B/%) $(PROGRAMS:%=$B/%)
 	@EXPECTED_SKIPS=$(if $(wildcard ../shared/assets/robot.glb),0,3) scripts/run-tests.sh $B $(TESTS)
 
 $B/bench_kernels: $(BENCH) $B/tests/net.o

@@ -3,19 +3,12 @@
 
 #include <math.h>
 #include <string.h>
-#include <time.h>
 
 #include "data/raster_inside.h"
+#include "lib/log.h"
 #include "lib/thread.h"
 
 #define RUN 2048 /* vertices of a task */
-
-double dar_raster_seconds(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
 
 dar_raster_config dar_raster_default(int width, int height)
 {
@@ -209,19 +202,19 @@ static void draw_tile(void *ctx, size_t tile, int thread)
     (void)thread;
 
     if (!some && !(j->last && in->used[tile])) return;
-    double begin = dar_raster_seconds();
+    double begin = dar_log_clock();
     if (some) dar_raster_cover(j->r, tile, !in->used[tile]);
     in->used[tile] = true;
-    double middle = dar_raster_seconds();
+    double middle = dar_log_clock();
     if (j->last) dar_raster_resolve(j->r, j->pose, j->out, tile);
     in->spent[tile][0] += middle - begin;
-    in->spent[tile][1] += dar_raster_seconds() - middle;
+    in->spent[tile][1] += dar_log_clock() - middle;
 }
 
 /* Seconds since *mark, which moves on. */
 static double lap(double *mark)
 {
-    double now = dar_raster_seconds(), d = now - *mark;
+    double now = dar_log_clock(), d = now - *mark;
     *mark = now;
     return d;
 }
@@ -264,7 +257,7 @@ void dar_raster_draw(dar_raster *r, const dar_pose *p, const dar_view *v, const 
                      const dar_gbuffer *last)
 {
     struct dar_raster_inside *in = r->in;
-    double *seconds = r->stats.seconds, mark = dar_raster_seconds();
+    double *seconds = r->stats.seconds, mark = dar_log_clock();
     bool moved = !in->drawn || !same_view(v, &r->view), fresh = !in->drawn || (out->normal && !in->has_normals);
 
     DAR_ASSERT(p->scene == r->scene, "raster: pose of another scene");

@@ -61,8 +61,6 @@ struct dar_raster_inside {
     bool drawn, has_normals; /* something; with normals */
 };
 
-double dar_raster_seconds(void);
-
 /* Corners of triangle t of a mesh: number of posed vertices of its instance. */
 static inline void dar_raster_corners(const dar_raster *r, uint32_t instance, size_t t, size_t corner[3])
 {

@@ -227,11 +227,40 @@ dar_status dar_args_parse(dar_program *p, int argc, char **argv, dar_err *e)
     }
     while (s.at < argc) {
         char *word = argv[s.at++];
+        if (p->commands && word[0] != '-') {
+            p->rest = argv + s.at - 1;
+            p->rests = argc - s.at + 1;
+            break;
+        }
         if (!options || word[0] != '-' || !word[1]) p->rest[p->rests++] = word;
         else if (strcmp(word, "--") == 0) options = false;
         else DAR_TRY(take_word(&s, word, e));
     }
-    return p->help || p->version ? DAR_OK : check_rest(p, e);
+    return p->help || p->version || p->commands ? DAR_OK : check_rest(p, e);
+}
+
+static const char *command_name(const dar_program *command)
+{
+    const char *space = strrchr(command->name, ' ');
+    return space ? space + 1 : command->name;
+}
+
+dar_status dar_args_command(const dar_program *p, const dar_program **command, dar_err *e)
+{
+    const char *word = p->rests ? p->rest[0] : "";
+    char known[256] = "";
+    size_t at = 0;
+    dar_nearest near = dar_nearest_to(word);
+    for (size_t i = 0; p->commands[i]; i++) {
+        const char *name = command_name(*command = p->commands[i]);
+        if (strcmp(name, word) == 0) return DAR_OK;
+        dar_nearest_try(&near, name);
+        if (at < sizeof known) at += (size_t)snprintf(known + at, sizeof known - at, "%s%s", i ? ", " : "", name);
+    }
+    *command = NULL;
+    if (!*word) return dar_fail(e, DAR_ERR_USAGE, "%s: expected a command: %s", p->name, known);
+    if (!near.best) return dar_fail(e, DAR_ERR_USAGE, "%s: found '%s', expected a command: %s", p->name, word, known);
+    return dar_fail(e, DAR_ERR_USAGE, "%s: found '%s', expected a command; did you mean %s?", p->name, word, near.best);
 }
 
 dar_status dar_common_apply(const dar_common *c, dar_err *e)
@@ -258,6 +287,13 @@ static void wrap(FILE *to, const char *text, int at, int indent)
         text += strspn(text, " ");
     }
     fprintf(to, "\n");
+}
+
+static void help_command(FILE *to, const dar_program *command)
+{
+    int at = fprintf(to, "  %s", command_name(command));
+    fprintf(to, "%*s", at < INDENT ? INDENT - at : 1, "");
+    wrap(to, command->summary, INDENT, INDENT);
 }
 
 static void help_option(FILE *to, const dar_option *o)
@@ -287,8 +323,11 @@ void dar_args_help(const dar_program *p, FILE *to)
     dar_common unused;
     dar_option common[COMMON];
 
-    fprintf(to, "usage: %s%s%s [options]\n\n", p->name, p->rest_name ? " " : "", p->rest_name ? p->rest_name : "");
+    const char *rest = p->commands ? "COMMAND" : p->rest_name;
+    fprintf(to, "usage: %s%s%s [options]\n\n", p->name, rest ? " " : "", rest ? rest : "");
     wrap(to, p->summary, 0, 0);
+    if (p->commands) fprintf(to, "\nCommands; COMMAND --help tells more:\n");
+    for (size_t i = 0; p->commands && p->commands[i]; i++) help_command(to, p->commands[i]);
     if (p->rest_help) {
         int at = fprintf(to, "\n  %s", p->rest_name) - 1;
         if (at >= INDENT - 1) at = fprintf(to, "\n") - 1;
@@ -297,7 +336,7 @@ void dar_args_help(const dar_program *p, FILE *to)
     }
     if (p->n_options && p->options[0].name) fprintf(to, "\nOptions:\n");
     for (size_t i = 0; i < p->n_options; i++) help_option(to, &p->options[i]);
-    fprintf(to, "\nOptions of every program:\n");
+    fprintf(to, "\n%s:\n", p->commands ? "Options" : "Options of every program");
     if (p->common) common_options(&unused, common);
     for (size_t i = 0; p->common && i < COMMON; i++) help_option(to, &common[i]);
     for (size_t i = 0; i < DAR_COUNT(last); i++) help_option(to, &last[i]);

@@ -63,12 +63,19 @@ typedef struct dar_common {
     const char *cpu_mask;
 } dar_common;
 
+struct dar_run;
+typedef dar_status dar_run_fn(struct dar_run *r, dar_err *e); /* lib/program.h */
+
 typedef struct dar_program {
     const char *name;    /* as typed: "dar-bundle render" */
     const char *summary; /* what it does, one sentence */
     const dar_option *options;
     size_t n_options;
     dar_common *common; /* NULL: takes none of them */
+    dar_run_fn *run;
+
+    /* Instead of run: what the first argument chooses from, by the last word of their names; ends with NULL. */
+    const struct dar_program *const *commands;
 
     /* Arguments that are not options: "BUNDLE..." */
     const char *rest_name, *rest_help;
@@ -80,8 +87,12 @@ typedef struct dar_program {
     bool help, version; /* asked for; nothing else was checked to be complete */
 } dar_program;
 
-/* Fill the targets: defaults first, then what argv says; argv[0] is skipped.  Failures are DAR_ERR_USAGE. */
+/* Fill the targets: defaults first, then what argv says; argv[0] is skipped.  A program of commands keeps everything
+ * from the command on as its rest.  Failures are DAR_ERR_USAGE. */
 dar_status dar_args_parse(dar_program *p, int argc, char **argv, dar_err *e);
+
+/* The command that the first of the rest names.  On failure *command is NULL. */
+dar_status dar_args_command(const dar_program *p, const dar_program **command, dar_err *e);
 
 /* Print help or version, if asked for, and tell so. */
 bool dar_args_answer(const dar_program *p, FILE *to);

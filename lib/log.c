@@ -60,7 +60,7 @@ void dar_log(dar_log_level level, const char *fmt, ...)
 
 /* ---------------------------------------------------------------- progress */
 
-static double now(void)
+double dar_log_clock(void)
 {
     struct timespec t;
     clock_gettime(CLOCK_MONOTONIC, &t);
@@ -116,7 +116,9 @@ static void show(dar_progress *p, double at, const char *note, bool last)
 dar_progress dar_progress_begin(const char *what, const char *unit, double total)
 {
     bool terminal = on_terminal();
-    dar_progress p = { .what = what, .unit = unit, .total = total, .begun = now(), .interval = terminal ? 0.1 : 10 };
+    dar_progress p = {
+        .what = what, .unit = unit, .total = total, .begun = dar_log_clock(), .interval = terminal ? 0.1 : 10
+    };
     p.shown = p.begun;
     if (terminal) show(&p, p.begun, NULL, false);
     return p;
@@ -124,12 +126,12 @@ dar_progress dar_progress_begin(const char *what, const char *unit, double total
 
 void dar_progress_step(dar_progress *p, double done, const char *note)
 {
-    double at = now();
+    double at = dar_log_clock();
     p->done = done;
     if (at - p->shown >= p->interval) show(p, at, note, false);
 }
 
 void dar_progress_end(dar_progress *p)
 {
-    show(p, now(), NULL, true);
+    show(p, dar_log_clock(), NULL, true);
 }

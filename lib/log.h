@@ -39,6 +39,9 @@ void dar_progress_end(dar_progress *p);
 /* "sample: 12/50 steps, 24 %, 1.5 steps/s, 25 s left, NOTE" after so many seconds; returns buf. */
 char *dar_progress_text(const dar_progress *p, double seconds, const char *note, char *buf, size_t size);
 
+/* Of a monotonic clock [s]. */
+double dar_log_clock(void);
+
 /* "0.5 s", "42 s", "3 min 20 s", "2 h 5 min", "3 d 4 h"; returns buf. */
 char *dar_log_duration(double seconds, char *buf, size_t size);
 

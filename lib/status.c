@@ -34,8 +34,14 @@ dar_status dar_fail(dar_err *e, dar_status s, const char *fmt, ...)
 int dar_status_exit(dar_status s)
 {
     static const int code[] = {
-        [DAR_OK] = 0,          [DAR_ERR_USAGE] = 2,         [DAR_ERR_IO] = 2, [DAR_ERR_FORMAT] = 2, [DAR_ERR_NOMEM] = 3,
-        [DAR_ERR_NUMERIC] = 1, [DAR_ERR_INTERRUPTED] = 130,
+        [DAR_OK] = 0,
+        [DAR_ERR_USAGE] = 2,
+        [DAR_ERR_IO] = 2,
+        [DAR_ERR_FORMAT] = 2,
+        [DAR_ERR_NOMEM] = 3,
+        [DAR_ERR_NUMERIC] = 1,
+        [DAR_ERR_INTERRUPTED] = 130,
+        [DAR_ERR_CHECK] = 1,
     };
     return code[s];
 }

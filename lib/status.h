@@ -13,6 +13,7 @@ typedef enum dar_status {
     DAR_ERR_NOMEM,       /* memory or disk is too small */
     DAR_ERR_NUMERIC,     /* NaN or Inf where numbers were expected */
     DAR_ERR_INTERRUPTED, /* stopped by a signal after saving */
+    DAR_ERR_CHECK,       /* the work is done; what was checked or compared does not hold */
 } dar_status;
 
 /* One line for the person: which file or key, what was found, what was expected.  Cut to fit between two characters,
@@ -25,7 +26,7 @@ typedef struct dar_err {
 dar_status dar_fail(dar_err *e, dar_status s, const char *fmt, ...) __attribute__((format(printf, 3, 4)));
 
 /* Exit status of a program that ends with s: 0 done, 2 wrong usage or bad input, 3 memory or disk, 130 interrupted;
- * a numeric failure is 1. */
+ * 1 a numeric failure, or a check that says no. */
 int dar_status_exit(dar_status s);
 
 /* Called by a failed DAR_ASSERT with the formatted text.  The default prints to stderr and aborts.  A handler that

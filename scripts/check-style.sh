@@ -78,7 +78,7 @@ BEGIN {
     rule("raw", C, none, "^[ \t]*#[ \t]*if[ \t]+0", "dead code")
     rule("code", C, none, "typedef.*[a-z0-9]_t[ ]*;|^}[ ]*[a-z0-9_]+_t[ ]*;", "type names have no _t")
     rooms = "^(lib|autograd|models|data)/"
-    rule("code", rooms, "^lib/(status|log|args)[.]c$", word "f?printf[ ]*[(][ ]*(std|\")", "rooms do not print")
+    rule("code", rooms, "^lib/(status|log|args|program)[.]c$", word "f?printf[ ]*[(][ ]*(std|\")", "rooms do not print")
 }
 
 FNR == 1 {

@@ -238,6 +238,51 @@ static void help(void **state)
     fclose(f);
 }
 
+/* A program of commands stops at the first word; what follows is the command's. */
+static void commands(void **state)
+{
+    (void)state;
+    static const dar_program render = { .name = "dar-test render", .summary = "Draw it." },
+                             check = { .name = "dar-test check", .summary = "Judge it." };
+    static const dar_program *const both[] = { &render, &check, NULL };
+    static char *argv[][4] = { { "dar-test", "check", "--json", "render" },
+                               { "dar-test", "--help", "chekc" },
+                               { "dar-test", "chekc" },
+                               { "dar-test", "paint" },
+                               { "dar-test", "" },
+                               { "dar-test" } };
+    static const char *const message[] = { [2] = "dar-test: found 'chekc', expected a command; did you mean check?",
+                                           [3] = "dar-test: found 'paint', expected a command: render, check",
+                                           [4] = "dar-test: expected a command: render, check",
+                                           [5] = "dar-test: expected a command: render, check" };
+    const dar_program *c;
+    char text[4096];
+    dar_err e;
+    for (size_t i = 0; i < DAR_COUNT(argv); i++) {
+        dar_program p = { .name = "dar-test", .summary = "Show how it is done.", .commands = both };
+        int argc = 0;
+        while (argc < 4 && argv[i][argc]) argc++;
+        assert_int_equal(dar_args_parse(&p, argc, argv[i], &e), DAR_OK);
+        dar_status s = dar_args_command(&p, &c, &e);
+        if (message[i]) {
+            CHECK(s == DAR_ERR_USAGE && !c, "'%s': accepted", argv[i][1]);
+            CHECK(strcmp(e.text, message[i]) == 0, "found:    %s\nexpected: %s", e.text, message[i]);
+        } else if (i == 0) {
+            assert_ptr_equal(c, &check);
+            assert_int_equal(p.rests, 3);
+            assert_string_equal(p.rest[1], "--json");
+        } else {
+            FILE *f = tmpfile();
+            assert_true(dar_args_answer(&p, f));
+            contents(f, text, sizeof text);
+            assert_non_null(strstr(text, "usage: dar-test COMMAND [options]\n"));
+            assert_non_null(
+                strstr(text, "\n  render                  Draw it.\n  check                   Judge it.\n"));
+            fclose(f);
+        }
+    }
+}
+
 /* What fn prints to standard error. */
 static char *printed(void (*fn)(void), char *buf, size_t size)
 {
@@ -316,7 +361,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(defaults),      cmocka_unit_test(everything),   cmocka_unit_test(refusals),
         cmocka_unit_test(help),          cmocka_unit_test(common_block), cmocka_unit_test(events),
-        cmocka_unit_test(progress_text),
+        cmocka_unit_test(progress_text), cmocka_unit_test(commands),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
