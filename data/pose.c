@@ -364,9 +364,13 @@ void dar_pose_init(dar_pose *p, const dar_scene *s, dar_arena *a)
     p->changed = dar_arena_push(a, s->instances);
     p->mirrored = dar_arena_push(a, s->instances);
     p->joint = dar_arena_push(a, s->skins * sizeof *p->joint);
-    for (size_t i = 0; i < s->skins; i++) p->joint[i] = dar_arena_push(a, s->skin[i].joints * sizeof **p->joint);
+    for (size_t i = 0; i < s->skins; i++) {
+        double(*joint)[12] = dar_arena_push(a, s->skin[i].joints * sizeof *joint);
+        if (!a->plan) p->joint[i] = joint;
+    }
     p->pieces = cut(s, NULL);
     p->piece = dar_arena_push(a, p->pieces * sizeof *p->piece);
+    if (a->plan) return;
     cut(s, p->piece);
     memset(p->world, 0, s->nodes * sizeof *p->world);
     memset(p->weight, 0, s->weights * sizeof *p->weight);

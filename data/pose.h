@@ -41,7 +41,7 @@ typedef struct dar_pose {
     bool *node_changed, *skin_changed, fresh;
 } dar_pose;
 
-/* Memory in `a`.  The pose lives as long as it and the scene. */
+/* Memory in `a`.  The pose lives as long as it and the scene.  In a planning arena: counts the bytes. */
 void dar_pose_init(dar_pose *p, const dar_scene *s, dar_arena *a);
 
 /* Set the moment: `animation` at t [s], or DAR_NONE.  DAR_ERR_NUMERIC: transforms that cannot be drawn, because a
