@@ -9,7 +9,7 @@
 
 #include "lib/file.h"
 #include "lib/json_write.h"
-#include "lib/safetensors.h"
+#include "lib/weights.h"
 
 #define SUFFIX ".safetensors"
 
@@ -43,7 +43,7 @@ static dar_status check_items(const struct plan *p, dar_err *e)
 {
     for (size_t i = 0; i < p->n; i++) {
         const dar_safetensors_item *t = &p->item[i];
-        DAR_ASSERT(*t->name && strlen(t->name) <= DAR_SAFETENSORS_NAME && strcmp(t->name, "__metadata__") != 0,
+        DAR_ASSERT(*t->name && strlen(t->name) <= DAR_WEIGHTS_NAME && strcmp(t->name, "__metadata__") != 0,
                    "safetensors: name '%s'", t->name);
         DAR_ASSERT(t->x.data && dar_tensor_contiguous(&t->x) && dar_tensor_count(&t->x),
                    "safetensors: %s: not contiguous, or empty", t->name);
@@ -123,7 +123,7 @@ static dar_status write_header(struct plan *p, struct shard *s, dar_err *e)
 
     size_t padding = (DAR_ALIGN - (8 + w->size) % DAR_ALIGN) % DAR_ALIGN;
     size_t header = w->size + padding;
-    DAR_ASSERT(s->n <= DAR_SAFETENSORS_TENSORS && header <= DAR_SAFETENSORS_HEADER,
+    DAR_ASSERT(s->n <= DAR_WEIGHTS_TENSORS && header <= DAR_WEIGHTS_HEADER,
                "safetensors: %zu tensors, %zu bytes of header", s->n, header);
     for (size_t i = 0; i < 8; i++) n[i] = (unsigned char)(header >> (8 * i));
     memset(pad, ' ', sizeof pad);

@@ -16,7 +16,7 @@
 #ifndef DAR_MODELS_LORA_H
 #define DAR_MODELS_LORA_H
 
-#include "lib/safetensors.h"
+#include "lib/weights.h"
 #include "models/dit.h"
 
 /* Declare a set of one rank on c->targets of every block; nothing if the rank is 0. */
@@ -30,7 +30,7 @@ typedef struct dar_lora_read_options {
 /* Read all weights of a file.  Products that have no addition get one of the file's rank, which may differ from product
  * to product; one that is declared must have the file's rank.  Fails on the first key that is none of this model's, a
  * missing half, a wrong shape; the model is then not to be used. */
-dar_status dar_lora_read(dar_dit *m, dar_params *p, dar_safetensors *f, const dar_lora_read_options *o, dar_err *e);
+dar_status dar_lora_read(dar_dit *m, dar_params *p, dar_weights *f, const dar_lora_read_options *o, dar_err *e);
 
 /* Write all additions with their alpha, in the types they are stored in. */
 dar_status dar_lora_write(const dar_dit *m, const char *path, dar_err *e);

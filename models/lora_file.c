@@ -77,10 +77,10 @@ struct found {
     const char *name[3]; /* by part; NULL: nothing */
 };
 
-static dar_status collect(struct found *found, int64_t layers, dar_safetensors *f, dar_err *e)
+static dar_status collect(struct found *found, int64_t layers, dar_weights *f, dar_err *e)
 {
-    for (size_t i = 0; i < dar_safetensors_count(f); i++) {
-        const dar_safetensors_entry *x = dar_safetensors_at(f, i);
+    for (size_t i = 0; i < dar_weights_count(f); i++) {
+        const dar_weight *x = dar_weights_at(f, i);
         dar_lora_key k;
         if (!dar_lora_parse(&k, x->name, layers))
             return dar_fail(e, DAR_ERR_FORMAT,
@@ -100,7 +100,7 @@ static dar_status wrong_shape(const char *name, const dar_tensor *x, dar_shape w
                     dar_shape_text(&x->shape, found, sizeof found), dar_shape_text(&want, expected, sizeof expected));
 }
 
-static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const struct found *in, dar_safetensors *f,
+static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const struct found *in, dar_weights *f,
                                const dar_lora_read_options *o, dar_err *e)
 {
     int64_t block = index / DAR_PROJECTIONS;
@@ -111,12 +111,12 @@ static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const s
     dar_tensor down, up, alpha;
 
     if (!name[DAR_LORA_DOWN] || !name[DAR_LORA_UP])
-        return dar_fail(e, DAR_ERR_FORMAT, "%s: found %s alone, expected both factors", dar_safetensors_at(f, 0)->file,
+        return dar_fail(e, DAR_ERR_FORMAT, "%s: found %s alone, expected both factors", dar_weights_at(f, 0)->file,
                         name[0]   ? name[0]
                         : name[1] ? name[1]
                                   : name[2]);
-    DAR_TRY(dar_safetensors_tensor(f, name[DAR_LORA_DOWN], &down, e));
-    DAR_TRY(dar_safetensors_tensor(f, name[DAR_LORA_UP], &up, e));
+    DAR_TRY(dar_weights_tensor(f, name[DAR_LORA_DOWN], &down, e));
+    DAR_TRY(dar_weights_tensor(f, name[DAR_LORA_UP], &up, e));
     int64_t rank = q->down ? q->down->x.shape.d[0] : down.shape.d[0];
     dar_shape want[] = { DAR_SHAPE(rank, d[1]), DAR_SHAPE(d[0], rank) };
     if (!dar_shape_equal(&down.shape, &want[0])) return wrong_shape(name[DAR_LORA_DOWN], &down, want[0], e);
@@ -124,7 +124,7 @@ static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const s
 
     double a = o->alpha > 0 ? o->alpha : (double)rank;
     if (name[DAR_LORA_ALPHA]) {
-        DAR_TRY(dar_safetensors_tensor(f, name[DAR_LORA_ALPHA], &alpha, e));
+        DAR_TRY(dar_weights_tensor(f, name[DAR_LORA_ALPHA], &alpha, e));
         if (dar_tensor_count(&alpha) != 1) return wrong_shape(name[DAR_LORA_ALPHA], &alpha, (dar_shape){ 0 }, e);
         a = dar_dtype_get(alpha.dtype, alpha.data, 0);
     }
@@ -135,7 +135,7 @@ static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const s
     return DAR_OK;
 }
 
-dar_status dar_lora_read(dar_dit *m, dar_params *p, dar_safetensors *f, const dar_lora_read_options *o, dar_err *e)
+dar_status dar_lora_read(dar_dit *m, dar_params *p, dar_weights *f, const dar_lora_read_options *o, dar_err *e)
 {
     int64_t n = m->c.layers * DAR_PROJECTIONS;
     struct found *found = calloc((size_t)n, sizeof *found);

@@ -3,9 +3,10 @@
 
     safetensors    reference.safetensors   pip install torch==2.13.0 safetensors numpy
     torch_rng      torch_rng.json          pip install torch==2.13.0 numpy; on a processor with AVX2
+    torch_file     torch_*.pth             pip install torch==2.13.0
     solvers        solvers.json            pip install torch==2.13.0 diffusers==0.42.1
     h5             foreign.h5              pip install h5py==3.16.0 numpy
-    corpus         ../corpus/              nothing
+    corpus         ../corpus/              the files of torch_file
 
 Run from the root of the tree.  The tests need none of this: the files are committed.
 """
@@ -78,6 +79,22 @@ def torch_rng():
         f.write(json.dumps(out, separators=(",", ":")).replace('{"dtype"', '\n{"dtype"') + "\n")
 
 
+def torch_file():
+    """A state dict of three types in both containers, and one inside a checkpoint with other things beside it."""
+    import torch
+
+    x = torch.arange(6).reshape(2, 3) / 4 - 0.5
+    state = {"f32": x, "bf16": x.bfloat16(), "half": x[1].half(), "steps": torch.tensor(7), "tied": x}
+    torch.save(state, "tests/fixtures/torch_zip.pth")
+    torch.save(state, "tests/fixtures/torch_old.pth", _use_new_zipfile_serialization=False)
+    model = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))
+    model.load_state_dict({k: torch.full_like(v, 1.5) for k, v in model.state_dict().items()})
+    model[0].weight.data[1, 2] = -2
+    torch.save({"epoch": 3, "rates": [1e-4, 5e-5], "state_dict": model.state_dict()}, "tests/fixtures/torch_inner.pth")
+    torch.save({"p": torch.nn.Parameter(x)}, "tests/fixtures/torch_parameter.pth")
+    torch.save({"turned": x.t()}, "tests/fixtures/torch_strided.pth")
+
+
 def solvers():
     """The public schedulers in f64: states before and after every step, for velocities that are tanh(2 z) + sigma."""
     import json
@@ -142,6 +159,33 @@ def corpus():
         return f'{{"dtype":"{dtype}","shape":{shape},"data_offsets":[{begin},{end}]}}'
 
     f32 = record("F32", [2], 0, 8)
+    def text(s):
+        return b"X" + struct.pack("<I", len(s)) + s.encode()
+
+    ref = b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + b"K\x02tQ"
+    rebuild = b"ctorch._utils\n_rebuild_tensor_v2\n("
+    tensor = rebuild + ref + b"K\x00K\x02\x85K\x01\x85\x89}tR"
+    files = {}
+    for name in ("zip", "old", "inner", "parameter", "strided"):
+        with open(f"tests/fixtures/torch_{name}.pth", "rb") as f:
+            files[name] = f.read()
+    put("torch_file", files | {
+        "cut_zip": files["zip"][:-30],
+        "one": b"\x80\x02}" + text("a") + tensor + b"s.",
+        "two": b"\x80\x02}(" + text("a") + tensor + text("b") + tensor + b"u.",
+        "ordered": b"\x80\x02ccollections\nOrderedDict\n](](" + text("a") + tensor + b"ee\x85R.",
+        "memo": b"\x80\x02}q\x00" + text("a") + b"q\x01" + tensor + b"q\x02sh\x01h\x02s.",
+        "untyped": b"\x80\x02}" + text("a") + b"ctorch._utils\n_rebuild_tensor_v3\n("
+                   + ref.replace(b"torch\nFloatStorage", b"torch.storage\nUntypedStorage").replace(b"K\x02", b"K\x08")
+                   + b"K\x00K\x02\x85K\x01\x85\x89}ctorch\nfloat32\ntRs.",
+        "nested": b"\x80\x02}" + text("model") + b"}" + text("a") + tensor + b"s" + text("epoch")
+                  + b"\x8a\x02\xff\x7fs.",
+        "attributes": b"\x80\x02ccollections\nOrderedDict\n)R" + text("a") + tensor + b"s}" + text("_metadata")
+                      + b"}sb.",
+        "call": b"\x80\x02cos\nsystem\n" + text("ls") + b"\x85R.",
+        "laugh": b"\x80\x02)" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(30)) + b".",
+    })
+
     put("safetensors", {
         "empty": file("{}"),
         "padded": file('{"a":' + f32 + "}   ", 8),
@@ -379,7 +423,7 @@ def image_files():
 
 
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (safetensors, torch_rng, solvers, h5, corpus)}
+    known = {f.__name__: f for f in (safetensors, torch_rng, torch_file, solvers, h5, corpus)}
     if not sys.argv[1:] or any(name not in known for name in sys.argv[1:]):
         sys.exit(__doc__)
     for name in sys.argv[1:]:

@@ -75,22 +75,22 @@ void model_clip(model *o, int64_t frames, int64_t rows, int64_t columns, int64_t
     o->count[1] = text;
 }
 
-static void read(dar_safetensors *f, const char *name, dar_tensor *x)
+static void read(dar_weights *f, const char *name, dar_tensor *x)
 {
     dar_err e;
     dar_tensor y;
-    must(dar_safetensors_tensor(f, name, &y, &e), &e);
+    must(dar_weights_tensor(f, name, &y, &e), &e);
     dar_tensor_copy(x, &y);
 }
 
-void model_fixture(model *o, dar_safetensors *weights)
+void model_fixture(model *o, dar_weights *weights)
 {
     dar_err e;
     dar_tensor x;
     for (size_t i = 0; i < o->p.count; i++) {
         dar_param *q = o->p.at[i];
         if (q->info.role == DAR_PARAM_LORA) continue;
-        must(dar_safetensors_tensor(weights, q->name, &x, &e), &e);
+        must(dar_weights_tensor(weights, q->name, &x, &e), &e);
         dar_param_bind(&o->p, q, &x);
     }
     model_clip(o, 3, 2, 3, 7);

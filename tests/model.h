@@ -2,7 +2,7 @@
 #ifndef DAR_TESTS_MODEL_H
 #define DAR_TESTS_MODEL_H
 
-#include "lib/safetensors.h"
+#include "lib/weights.h"
 #include "models/config.h"
 #include "models/dit.h"
 #include "models/lora.h"
@@ -34,7 +34,7 @@ void model_free(model *o);
 void model_clip(model *o, int64_t frames, int64_t rows, int64_t columns, int64_t text);
 
 /* Values of parameters and inputs as the files of scripts/make-dit-fixtures.py have them. */
-void model_fixture(model *o, dar_safetensors *weights);
+void model_fixture(model *o, dar_weights *weights);
 
 /* Scene, text, velocity of the clip on the model's tape, which is cleared first; the times are those of the fixtures.
  */

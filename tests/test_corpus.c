@@ -13,6 +13,7 @@ int fuzz_image(const uint8_t *data, size_t size);
 int fuzz_json(const uint8_t *data, size_t size);
 int fuzz_obj(const uint8_t *data, size_t size);
 int fuzz_safetensors(const uint8_t *data, size_t size);
+int fuzz_torch_file(const uint8_t *data, size_t size);
 
 static void replay(const char *dir, int (*target)(const uint8_t *, size_t))
 {
@@ -79,10 +80,17 @@ static void safetensors(void **state)
     replay("tests/corpus/safetensors", fuzz_safetensors);
 }
 
+static void torch_file(void **state)
+{
+    (void)state;
+    replay("tests/corpus/torch_file", fuzz_torch_file);
+}
+
 int main(void)
 {
-    const struct CMUnitTest tests[] = { cmocka_unit_test(camera),     cmocka_unit_test(exr),  cmocka_unit_test(gltf),
-                                        cmocka_unit_test(image),      cmocka_unit_test(json), cmocka_unit_test(obj),
-                                        cmocka_unit_test(safetensors) };
+    const struct CMUnitTest tests[] = { cmocka_unit_test(camera),      cmocka_unit_test(exr),
+                                        cmocka_unit_test(gltf),        cmocka_unit_test(image),
+                                        cmocka_unit_test(json),        cmocka_unit_test(obj),
+                                        cmocka_unit_test(safetensors), cmocka_unit_test(torch_file) };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }

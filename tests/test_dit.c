@@ -20,16 +20,16 @@ static double distance(const dar_tensor *x, const dar_tensor *y)
 
 struct parity {
     model o;
-    dar_safetensors *weights, *lora, *stages;
+    dar_weights *weights, *lora, *stages;
     double bound, grad_bound;
     double worst, worst_grad;
 };
 
-static dar_safetensors *open_fixture(const char *path)
+static dar_weights *open_fixture(const char *path)
 {
-    dar_safetensors *f;
+    dar_weights *f;
     dar_err e;
-    CHECK(dar_safetensors_open(&f, path, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_weights_open(&f, path, &e) == DAR_OK, "%s", e.text);
     return f;
 }
 
@@ -55,16 +55,16 @@ static void parity_init(struct parity *p, dar_dtype storage, double bound, doubl
 static void parity_free(struct parity *p)
 {
     model_free(&p->o);
-    dar_safetensors_close(p->weights);
-    dar_safetensors_close(p->lora);
-    dar_safetensors_close(p->stages);
+    dar_weights_close(p->weights);
+    dar_weights_close(p->lora);
+    dar_weights_close(p->stages);
 }
 
 static void compare(struct parity *p, const char *name, const dar_tensor *x, double bound, double *worst)
 {
     dar_tensor y;
     dar_err e;
-    CHECK(dar_safetensors_tensor(p->stages, name, &y, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_weights_tensor(p->stages, name, &y, &e) == DAR_OK, "%s", e.text);
     CHECK(dar_tensor_count(x) == dar_tensor_count(&y), "%s: %zu numbers, expected %zu", name, dar_tensor_count(x),
           dar_tensor_count(&y));
     double d = distance(x, &y);
@@ -84,7 +84,7 @@ static void text_stage(struct parity *p, const char *what, int block, const dar_
     dar_tensor y, here, there;
     dar_err e;
     snprintf(name, sizeof name, "%s.%d", what, block);
-    CHECK(dar_safetensors_tensor(p->stages, name, &y, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_weights_tensor(p->stages, name, &y, &e) == DAR_OK, "%s", e.text);
     for (int64_t b = 0; b < 2; b++)
         for (int64_t i = 0; i <= p->o.count[b]; i++) {
             int64_t row = i < p->o.count[b] ? i : p->o.text.shape.d[1];

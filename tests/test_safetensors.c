@@ -8,8 +8,8 @@
 #include <unistd.h>
 
 #include "lib/file.h"
-#include "lib/safetensors.h"
 #include "lib/safetensors_write.h"
+#include "lib/weights.h"
 
 static char dir[64];
 
@@ -75,20 +75,20 @@ static unsigned char *file_of(const char *header, size_t length, size_t data, si
 
 static dar_status parse_copy(const unsigned char *data, size_t size, dar_err *e)
 {
-    dar_safetensors *s;
+    dar_weights *s;
     unsigned char *exact = malloc(size ? size : 1);
     memcpy(exact, data, size);
-    dar_status status = dar_safetensors_parse(&s, "t.st", exact, size, e);
+    dar_status status = dar_weights_parse(&s, "t.st", exact, size, e);
     if (status == DAR_OK)
-        for (size_t i = 0; i < dar_safetensors_count(s); i++) {
-            const dar_safetensors_entry *t = dar_safetensors_at(s, i);
+        for (size_t i = 0; i < dar_weights_count(s); i++) {
+            const dar_weight *t = dar_weights_at(s, i);
             const unsigned char *p = t->data;
             CHECK(p >= exact + 8 && t->bytes <= size && p + t->bytes <= exact + size, "%s: outside of the file",
                   t->name);
-            assert_ptr_equal(dar_safetensors_find(s, t->name), t);
+            assert_ptr_equal(dar_weights_find(s, t->name), t);
         }
     else assert_null(s);
-    dar_safetensors_close(s);
+    dar_weights_close(s);
     free(exact);
     return status;
 }
@@ -217,7 +217,7 @@ static void damaged_lengths(void **state)
     free(p);
     free(deep);
 
-    size_t huge = DAR_SAFETENSORS_HEADER + 1;
+    size_t huge = DAR_WEIGHTS_HEADER + 1;
     char *wide = malloc(huge);
     memset(wide, ' ', huge);
     memcpy(wide, "{}", 2);
@@ -276,7 +276,7 @@ static void flipped_everywhere(void **state)
 static void many_tensors(void **state)
 {
     (void)state;
-    size_t limit = DAR_SAFETENSORS_TENSORS, room = 100 * (limit + 1), at, size;
+    size_t limit = DAR_WEIGHTS_TENSORS, room = 100 * (limit + 1), at, size;
     char *text = malloc(room);
     dar_err e = { "" };
     for (size_t n = limit; n <= limit + 1; n++) {
@@ -297,7 +297,7 @@ static void many_tensors(void **state)
 static void views(void **state)
 {
     (void)state;
-    dar_safetensors *s;
+    dar_weights *s;
     dar_err e;
     dar_tensor x;
     size_t size;
@@ -308,35 +308,35 @@ static void views(void **state)
 
     for (size_t shift = 0; shift < 4; shift++) { /* one of them is aligned, the others are copied */
         memcpy(moved + shift, p, size);
-        assert_int_equal(dar_safetensors_parse(&s, "t.st", moved + shift, size, &e), DAR_OK);
-        assert_int_equal(dar_safetensors_count(s), 3);
-        assert_string_equal(dar_safetensors_meta(s, "format"), "pt");
-        assert_null(dar_safetensors_meta(s, "other"));
-        assert_int_equal(dar_safetensors_tensor(s, "b", &x, &e), DAR_OK);
+        assert_int_equal(dar_weights_parse(&s, "t.st", moved + shift, size, &e), DAR_OK);
+        assert_int_equal(dar_weights_count(s), 3);
+        assert_string_equal(dar_weights_meta(s, "format"), "pt");
+        assert_null(dar_weights_meta(s, "other"));
+        assert_int_equal(dar_weights_tensor(s, "b", &x, &e), DAR_OK);
         assert_int_equal((uintptr_t)x.data % 4, 0);
         assert_int_equal(x.shape.n, 2);
         assert_int_equal(x.shape.d[1], 3);
         CHECK_NEAR("b[5]", ((float *)x.data)[5], 1.5, 0);
-        assert_int_equal(dar_safetensors_tensor(s, "a.w", &x, &e), DAR_OK);
+        assert_int_equal(dar_weights_tensor(s, "a.w", &x, &e), DAR_OK);
         assert_int_equal(x.dtype, DAR_BF16);
 
-        assert_int_equal(dar_safetensors_tensor(s, "\xc3\xa9", &x, &e), DAR_ERR_FORMAT);
+        assert_int_equal(dar_weights_tensor(s, "\xc3\xa9", &x, &e), DAR_ERR_FORMAT);
         same_text(e.text, "t.st: \xc3\xa9: dtype I64, expected F64, F32, BF16 or F16");
-        assert_string_equal(dar_safetensors_find(s, "\xc3\xa9")->type, "I64");
-        assert_int_equal(dar_safetensors_tensor(s, "a.x", &x, &e), DAR_ERR_FORMAT);
+        assert_string_equal(dar_weights_find(s, "\xc3\xa9")->type, "I64");
+        assert_int_equal(dar_weights_tensor(s, "a.x", &x, &e), DAR_ERR_FORMAT);
         same_text(e.text, "t.st: a.x: no such tensor; did you mean 'a.w'?");
-        dar_safetensors_close(s);
+        dar_weights_close(s);
     }
     free(p);
 
     static const char seven[] = "{\"a\":" T("F32", "1,1,1,1,1,1,2", "0,8") ",\"b\":" T("X9", "3", "8,9") "}";
     p = file_of(seven, strlen(seven), 9, &size);
-    assert_int_equal(dar_safetensors_parse(&s, "t.st", p, size, &e), DAR_OK); /* unless they are wanted */
-    assert_int_equal(dar_safetensors_tensor(s, "a", &x, &e), DAR_ERR_FORMAT);
+    assert_int_equal(dar_weights_parse(&s, "t.st", p, size, &e), DAR_OK); /* unless they are wanted */
+    assert_int_equal(dar_weights_tensor(s, "a", &x, &e), DAR_ERR_FORMAT);
     same_text(e.text, "t.st: a: 7 dimensions, expected at most 6");
-    assert_int_equal(dar_safetensors_tensor(s, "b", &x, &e), DAR_ERR_FORMAT);
+    assert_int_equal(dar_weights_tensor(s, "b", &x, &e), DAR_ERR_FORMAT);
     same_text(e.text, "t.st: b: dtype X9, expected F64, F32, BF16 or F16");
-    dar_safetensors_close(s);
+    dar_weights_close(s);
     free(p);
     free(moved);
 }
@@ -361,25 +361,25 @@ static size_t items(dar_safetensors_item *item)
 static void check_items(const char *path)
 {
     dar_safetensors_item item[5];
-    dar_safetensors *s;
+    dar_weights *s;
     dar_err e;
     size_t n = items(item);
-    CHECK(dar_safetensors_open(&s, path, &e) == DAR_OK, "%s", e.text);
-    assert_int_equal(dar_safetensors_count(s), n);
+    CHECK(dar_weights_open(&s, path, &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_weights_count(s), n);
     for (size_t i = 0; i < n; i++) {
         dar_tensor x;
-        const dar_safetensors_entry *t = dar_safetensors_find(s, item[i].name);
+        const dar_weight *t = dar_weights_find(s, item[i].name);
         size_t bytes = dar_tensor_count(&item[i].x) * dar_dtype_size(item[i].x.dtype);
         assert_non_null(t);
         assert_int_equal(t->bytes, bytes);
         assert_memory_equal(t->data, item[i].x.data, bytes);
         if (item[i].x.dtype == DAR_I8) continue;
-        CHECK(dar_safetensors_tensor(s, item[i].name, &x, &e) == DAR_OK, "%s", e.text);
+        CHECK(dar_weights_tensor(s, item[i].name, &x, &e) == DAR_OK, "%s", e.text);
         assert_ptr_equal(x.data, t->data); /* our own files lie straight: nothing is copied */
         assert_int_equal(x.dtype, item[i].x.dtype);
         assert_true(dar_shape_equal(&x.shape, &item[i].x.shape));
     }
-    dar_safetensors_close(s);
+    dar_weights_close(s);
 }
 
 static void written_is_read(void **state)
@@ -388,7 +388,7 @@ static void written_is_read(void **state)
     dar_safetensors_item item[5];
     static const char *const meta[] = { "format", "pt", "ss_network_alpha", "16 \"\n", NULL };
     dar_err e;
-    dar_safetensors *s;
+    dar_weights *s;
     size_t n = items(item);
     CHECK(dar_safetensors_write(in_dir("m.safetensors"), item, n, &(dar_safetensors_options){ .meta = meta }, &e) ==
               DAR_OK,
@@ -396,16 +396,16 @@ static void written_is_read(void **state)
     check_items(in_dir("m.safetensors"));
     check_items(dir);
     assert_int_equal(files_in(dir, false), 1);
-    assert_int_equal(dar_safetensors_open(&s, in_dir("m.safetensors"), &e), DAR_OK);
-    assert_string_equal(dar_safetensors_meta(s, "ss_network_alpha"), "16 \"\n");
-    assert_int_equal((uintptr_t)dar_safetensors_at(s, 0)->data % 64, 0);
-    dar_safetensors_close(s);
+    assert_int_equal(dar_weights_open(&s, in_dir("m.safetensors"), &e), DAR_OK);
+    assert_string_equal(dar_weights_meta(s, "ss_network_alpha"), "16 \"\n");
+    assert_int_equal((uintptr_t)dar_weights_at(s, 0)->data % 64, 0);
+    dar_weights_close(s);
 
     assert_int_equal(dar_safetensors_write(in_dir("empty.safetensors"), NULL, 0, NULL, &e), DAR_OK);
-    assert_int_equal(dar_safetensors_open(&s, in_dir("empty.safetensors"), &e), DAR_OK);
-    assert_int_equal(dar_safetensors_count(s), 0);
-    dar_safetensors_close(s);
-    assert_int_equal(dar_safetensors_open(&s, dir, &e), DAR_ERR_FORMAT); /* two files: which? */
+    assert_int_equal(dar_weights_open(&s, in_dir("empty.safetensors"), &e), DAR_OK);
+    assert_int_equal(dar_weights_count(s), 0);
+    dar_weights_close(s);
+    assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_FORMAT); /* two files: which? */
 
     item[1].name = "q";
     CHECK_ABORTS(dar_safetensors_write(in_dir("m.safetensors"), item, n, NULL, &e));
@@ -457,7 +457,7 @@ static void damaged_indices(void **state)
         { "{\"weight_map\": {\"q\": \"c.safetensors\", \"third\": \"a.safetensors\"}}", "q: is not in c.safetensors" },
     };
     dar_safetensors_item item[5], other = { "other", dar_tensor_of(DAR_F32, DAR_SHAPE(6), f32_data) };
-    dar_safetensors *s;
+    dar_weights *s;
     dar_err e;
     items(item);
     item[1] = other;
@@ -467,7 +467,7 @@ static void damaged_indices(void **state)
     assert_int_equal(dar_safetensors_write(in_dir("c.safetensors"), &other, 1, NULL, &e), DAR_OK);
     for (size_t i = 0; i < DAR_COUNT(bad); i++) {
         put_text("m.safetensors.index.json", bad[i].map);
-        assert_int_equal(dar_safetensors_open(&s, dir, &e), DAR_ERR_FORMAT);
+        assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_FORMAT);
         assert_null(s);
         char expected[512], *mark;
         snprintf(expected, sizeof expected, "%s/m.safetensors.index.json: %s", dir, bad[i].message);
@@ -478,10 +478,10 @@ static void damaged_indices(void **state)
         same_text(e.text, expected);
     }
     put_text("m.safetensors.index.json", "{\"weight_map\": {\"q\": \"none.safetensors\"}}");
-    assert_int_equal(dar_safetensors_open(&s, dir, &e), DAR_ERR_IO);
-    assert_int_equal(dar_safetensors_open(&s, in_dir("none"), &e), DAR_ERR_IO);
+    assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_IO);
+    assert_int_equal(dar_weights_open(&s, in_dir("none"), &e), DAR_ERR_IO);
     files_in(dir, true);
-    assert_int_equal(dar_safetensors_open(&s, dir, &e), DAR_ERR_FORMAT);
+    assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_FORMAT);
 }
 
 /* A disk that fills up in the middle, played by a limit on the size of files: what was there stays. */
@@ -520,25 +520,25 @@ static void full_disk(void **state)
 static void foreign_file(void **state)
 {
     (void)state;
-    dar_safetensors *s;
+    dar_weights *s;
     dar_tensor x;
     dar_err e;
-    CHECK(dar_safetensors_open(&s, "tests/fixtures/reference.safetensors", &e) == DAR_OK, "%s", e.text);
-    assert_int_equal(dar_safetensors_count(s), 6);
-    assert_string_equal(dar_safetensors_meta(s, "made by"), "the reference writer");
+    CHECK(dar_weights_open(&s, "tests/fixtures/reference.safetensors", &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_weights_count(s), 6);
+    assert_string_equal(dar_weights_meta(s, "made by"), "the reference writer");
     static const char *const names[] = { "f64", "f32", "bf16", "f16" };
     for (size_t k = 0; k < DAR_COUNT(names); k++) {
-        CHECK(dar_safetensors_tensor(s, names[k], &x, &e) == DAR_OK, "%s", e.text);
+        CHECK(dar_weights_tensor(s, names[k], &x, &e) == DAR_OK, "%s", e.text);
         assert_string_equal(dar_dtype_name(x.dtype), names[k]);
         assert_int_equal(x.shape.n, 2);
         assert_int_equal(x.shape.d[0], 2);
         for (size_t i = 0; i < 6; i++) CHECK_NEAR(names[k], dar_dtype_get(x.dtype, x.data, i), (double)i / 4 - 0.5, 0);
     }
-    assert_int_equal(dar_safetensors_tensor(s, "scalar", &x, &e), DAR_OK);
+    assert_int_equal(dar_weights_tensor(s, "scalar", &x, &e), DAR_OK);
     assert_int_equal(x.shape.n, 0);
     CHECK_NEAR("scalar", *(float *)x.data, 7, 0);
-    assert_string_equal(dar_safetensors_find(s, "steps")->type, "I64");
-    dar_safetensors_close(s);
+    assert_string_equal(dar_weights_find(s, "steps")->type, "I64");
+    dar_weights_close(s);
 }
 
 int main(void)
