@@ -99,6 +99,20 @@ typedef struct dar_kern {
     void (*norm_sums)(size_t n, const dar_norm *s, const void *x, const void *gy, double sum[2], void *gw, void *gb);
     void (*norm_back)(size_t n, const dar_norm *s, const void *x, const void *gy, const double mean[2], void *gx);
 
+    /* Norm of the columns of a matrix whose rows lie ld apart, by stored type of x, i8 NULL.
+     *
+     *   column_sums    sum[j] = Σ_i w[i] x[i][j] z[i][j], or Σ_i x[i][j]^2 if z is NULL; in runs of 32 rows
+     *   column_norm    of one row: y[j] = x[j] r[j] w, y stored as x
+     *   column_back    of one row: gx[j] = gy[j] r[j] w + x[j] q[j]; returns Σ_j x[j] gy[j] r[j], in the accumulators
+     *                  of a reduction but of the table's type
+     *
+     * stream: write past the caches where y or gx is aligned as vectors are. */
+    void (*column_sums[DAR_DTYPES])(size_t rows, size_t n, size_t ld, const void *w, const void *x, const void *z,
+                                    void *sum);
+    void (*column_norm[DAR_DTYPES])(size_t n, double w, const void *r, const void *x, void *y, bool stream);
+    double (*column_back[DAR_DTYPES])(size_t n, double w, const void *r, const void *q, const void *x, const void *gy,
+                                      void *gx, bool stream);
+
     /* Rotate pairs (x[2i], x[2i+1]) by the angles whose cos, sin are the pairs of table; backward: by their negatives.
      * n elements, n even; the table's `period` elements (even) repeat. */
     void (*rope)(size_t n, size_t period, const void *x, const void *table, void *y, bool backward);

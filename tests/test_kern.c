@@ -147,6 +147,40 @@ static void call_scale_sums(const dar_kern *k, size_t n, struct rows *s)
     for (size_t i = 0; i < n / 2 * 2; i++) dar_dtype_set(s->type, s->row[2], i, y[i]);
 }
 
+/* Row 0 as a matrix, in the table's type or in 16 bits; its columns make more than a strip, its rows more than a run.
+ */
+static const void *matrix(const dar_kern *k, size_t n, const struct rows *s, dar_dtype t, uint16_t *half)
+{
+    if (t == s->type) return s->row[0];
+    k->put[t](n, s->row[0], half, false);
+    return half;
+}
+
+static void columns_of(const dar_kern *k, size_t n, struct rows *s, dar_dtype t)
+{
+    uint16_t half[LONGEST];
+    const void *x = matrix(k, n, s, t, half);
+    size_t wide = n / 3, high = n / 40;
+    k->column_sums[t](3, wide, wide, NULL, x, NULL, s->row[2]);
+    k->column_sums[t](high ? 40 : 0, high, high, s->row[1], x, s->row[4], s->row[3]);
+    s->value[0] = k->column_back[t](n, 0.7, s->row[1], s->row[4], x, s->row[4], s->row[0], true);
+}
+
+static void normed_columns_of(const dar_kern *k, size_t n, struct rows *s, dar_dtype t)
+{
+    _Alignas(64) uint16_t half[LONGEST];
+    const void *x = matrix(k, n, s, t, half);
+    k->column_norm[t](n, 0.7, s->row[1], x, t == s->type ? s->row[0] : half, true);
+    if (t != s->type) k->get[t](n, half, s->row[0]);
+}
+
+CALL(columns, columns_of(k, n, s, s->type))
+CALL(columns_bf16, columns_of(k, n, s, DAR_BF16))
+CALL(columns_f16, columns_of(k, n, s, DAR_F16))
+CALL(normed_columns, normed_columns_of(k, n, s, s->type))
+CALL(normed_columns_bf16, normed_columns_of(k, n, s, DAR_BF16))
+CALL(normed_columns_f16, normed_columns_of(k, n, s, DAR_F16))
+
 static const struct {
     const char *name;
     kernel_call *call;
@@ -179,6 +213,10 @@ static const struct {
     EXACT(norm_sums, 6 * LONGEST),
     EXACT(norm_sums_plain, 6 * LONGEST),
     EXACT(norm_back, 9 * 2),
+    EXACT(columns, 38 * LONGEST), /* each of 32 accumulators 31 times, their tree, two products */
+    EXACT(columns_bf16, 38 * LONGEST),
+    EXACT(columns_f16, 38 * LONGEST),
+    EXACT(normed_columns, 2 * 2),
     EXACT(rope, 3 * 2),
     EXACT(rope_long, 3 * 2),
     EXACT(adamw, 40), /* rate fix1 m / (sqrt(v fix2) + eps) is 20 at most; 14 roundings, most of less */
@@ -186,13 +224,15 @@ static const struct {
     EXACT(scale_sums, 3),
 };
 
-/* Row 1 holds bytes: only the bits of f32 are compared. */
+/* Row 1 holds bytes, or row 0 what was rounded to 16 bits: only the bits of f32 are compared. */
 static const struct {
     const char *name;
     kernel_call *call;
 } bytes[] = {
     { "quantise", call_quantise },
     { "quantise_nothing", call_quantise_nothing },
+    { "normed_columns_bf16", call_normed_columns_bf16 },
+    { "normed_columns_f16", call_normed_columns_f16 },
 };
 
 static struct rows found, expected, truth;

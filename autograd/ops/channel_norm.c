@@ -1,9 +1,7 @@
 /* channel_norm.c: the norm of the VAE, over channels that are strided in memory.
  *
- * Work goes by blocks of places.  The first pass brings all channels of a block together in scratch of the thread,
- * which the second-level cache holds (where they lie, their distance is often a power of two, and they would push each
- * other out); the second pass reads no memory.  Within a block every channel is a row, and what belongs to a place
- * (norm, products) is a row too. */
+ * Work goes by blocks of places, each of which is a matrix: channels are its rows, and what belongs to a place (norm,
+ * products) is a row too.  A block is read twice, the second time from the caches. */
 #include <math.h>
 #include <string.h>
 
@@ -12,9 +10,8 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define BLOCK 65536 /* elements of a block, at most, unless there are more than 1024 channels */
-#define RUN   32    /* channels added in a row; then the sums of the runs: short sums lose less */
-#define AHEAD 4     /* channels asked for before they are needed: no prefetcher follows from one to the next */
+#define BLOCK 65536 /* elements of a block, at most, unless there are more than 512 channels */
+#define STRIP 128   /* places; blocks are whole strips */
 #define LEAST 1e-24 /* of a squared norm */
 
 enum { X, W };
@@ -25,15 +22,14 @@ struct walk {
     const dar_kern *k;
     size_t channels, places, block, blocks; /* of one clip */
     dar_put mode;
-    size_t staged;  /* bytes of one tensor's block in scratch; each thread has two */
-    size_t scratch; /* in all; partial sums for the gradient of w, [clips blocks, C], are at the end */
-    size_t part;    /* where; 0: that gradient is not wanted */
+
+    /* Scratch: w in the arithmetic type, then, at `part`, the blocks' parts [clips blocks, C] of its gradient. */
+    size_t part, scratch;
 };
 
 /* Places [first, first + n) of clip `clip`. */
 struct block {
     size_t clip, first, n;
-    char *staged[2]; /* [C, n] of x, of gy */
 };
 
 static size_t tasks(const struct walk *w)
@@ -48,24 +44,19 @@ static struct walk walk_of(const dar_opctx *c)
     w.k = dar_kern_for(w.type);
     w.places = 1;
     for (int i = 2; i < x->shape.n; i++) w.places *= (size_t)x->shape.d[i];
-    w.block = w.channels ? BLOCK / w.channels / 64 * 64 : DAR_PIECE;
-    if (w.block < 64) w.block = 64;
+    w.block = w.channels ? BLOCK / w.channels / STRIP * STRIP : DAR_PIECE;
+    if (w.block < STRIP) w.block = STRIP;
     if (w.block > DAR_PIECE) w.block = DAR_PIECE;
     w.blocks = (w.places + w.block - 1) / w.block;
-    w.staged = dar_mul_size(w.channels, w.block * dar_dtype_size(w.type));
-    w.scratch = dar_mul_size(2 * (size_t)c->threads, w.staged);
-    if (c->gx[W].data) {
-        w.part = w.scratch;
-        w.scratch = dar_add_size(w.scratch, dar_mul_size(tasks(&w), w.channels * dar_dtype_size(w.type)));
-    }
+    w.part = w.scratch = dar_mul_size(w.channels, dar_dtype_size(w.type));
+    if (c->gx[W].data) w.scratch = dar_add_size(w.part, dar_mul_size(tasks(&w), w.part));
     return w;
 }
 
-static struct block block_of(const struct walk *w, size_t i, int thread)
+static struct block block_of(const struct walk *w, size_t i)
 {
     size_t first = i % w->blocks * w->block, left = w->places - first;
-    char *own = (char *)w->c->scratch + 2 * (size_t)thread * w->staged;
-    return (struct block){ i / w->blocks, first, left < w->block ? left : w->block, { own, own + w->staged } };
+    return (struct block){ i / w->blocks, first, left < w->block ? left : w->block };
 }
 
 static void *place(const struct walk *w, const struct block *b, const dar_tensor *x, size_t channel)
@@ -73,23 +64,14 @@ static void *place(const struct walk *w, const struct block *b, const dar_tensor
     return dar_tensor_at(x, (b->clip * w->channels + channel) * w->places + b->first);
 }
 
-static char *staged(const struct walk *w, const struct block *b, int which, size_t channel)
+static void convert_weights(const struct walk *w)
 {
-    return b->staged[which] + channel * b->n * dar_dtype_size(w->type);
-}
-
-/* Bring a channel of the block into scratch. */
-static const void *stage(const struct walk *w, const struct block *b, int which, const dar_tensor *x, size_t channel)
-{
-    void *row = staged(w, b, which, channel);
-    if (channel + AHEAD < w->channels) dar_row_ahead(place(w, b, x, channel + AHEAD), b->n * dar_dtype_size(x->dtype));
-    dar_row_convert(w->type, row, x->dtype, place(w, b, x, channel), b->n);
-    return row;
+    dar_row_convert(w->type, w->c->scratch, w->c->x[W].dtype, w->c->x[W].data, w->channels);
 }
 
 static double weight(const struct walk *w, size_t channel)
 {
-    return dar_dtype_get(w->c->x[W].dtype, w->c->x[W].data, channel);
+    return dar_dtype_get(w->type, w->c->scratch, channel);
 }
 
 /* r = sqrt(C) / max(||x||, 1e-12) from excess = ||x||^2 - 1e-24. */
@@ -103,98 +85,61 @@ static void scale_of(const struct walk *w, size_t n, const void *excess, void *r
 
 /* ---------------------------------------------------------------- forward */
 
-/* ||x||^2 - 1e-24 at every place. */
-static void squares(const struct walk *w, const struct block *b, void *excess)
-{
-    const dar_tensor *x = &w->c->x[X];
-    size_t bytes = b->n * dar_dtype_size(w->type);
-    double run[DAR_PIECE];
-
-    memset(excess, 0, bytes);
-    for (size_t c = 0; c < w->channels;) {
-        memset(run, 0, bytes);
-        for (size_t end = c + RUN < w->channels ? c + RUN : w->channels; c < end; c++) {
-            const void *row = stage(w, b, 0, x, c);
-            w->k->mul_add(b->n, row, row, run, run);
-        }
-        w->k->add(b->n, excess, run, excess);
-    }
-    w->k->offset(b->n, -LEAST, excess, excess);
-}
-
 static void forward_block(void *ctx, size_t i, int thread)
 {
     const struct walk *w = ctx;
-    const dar_tensor *y = &w->c->y, *aux = &w->c->aux;
-    struct block b = block_of(w, i, thread);
-    double excess[DAR_PIECE], r[DAR_PIECE], buf[DAR_PIECE];
+    const dar_tensor *x = &w->c->x[X], *y = &w->c->y, *aux = &w->c->aux;
+    struct block b = block_of(w, i);
+    double excess[DAR_PIECE], r[DAR_PIECE];
+    (void)thread;
 
-    squares(w, &b, excess);
+    w->k->column_sums[x->dtype](w->channels, b.n, w->places, NULL, place(w, &b, x, 0), NULL, excess);
+    w->k->offset(b.n, -LEAST, excess, excess);
     scale_of(w, b.n, excess, r);
     if (aux->data)
         dar_row_put(w->type, excess, aux->dtype, dar_tensor_at(aux, b.clip * w->places + b.first), b.n, DAR_PUT);
-    for (size_t c = 0; c < w->channels; c++) {
-        void *to = dar_row_out(w->type, y->dtype, place(w, &b, y, c), w->mode, buf);
-        w->k->mul(b.n, staged(w, &b, 0, c), r, to);
-        w->k->scale(b.n, weight(w, c), to, to);
-        dar_row_put(w->type, to, y->dtype, place(w, &b, y, c), b.n, w->mode);
-    }
+    for (size_t c = 0; c < w->channels; c++)
+        w->k->column_norm[x->dtype](b.n, weight(w, c), r, place(w, &b, x, c), place(w, &b, y, c),
+                                    w->mode == DAR_PUT_STREAM);
 }
 
 static void channel_norm_forward(const dar_opctx *c)
 {
     struct walk w = walk_of(c);
     w.mode = dar_put_for(dar_tensor_bytes(&c->y), false);
+    convert_weights(&w);
     dar_parallel(tasks(&w), forward_block, &w);
 }
 
 /* ---------------------------------------------------------------- backward */
 
-/* dot = sum over channels of w gy x at every place; the block's part of the gradient of w. */
-static void products(const struct walk *w, const struct block *b, const void *r, void *dot, char *part)
-{
-    const dar_tensor *x = &w->c->x[X], *gy = &w->c->gy;
-    size_t size = dar_dtype_size(w->type), bytes = b->n * size;
-    double buf[DAR_PIECE], run[DAR_PIECE];
-
-    memset(dot, 0, bytes);
-    for (size_t c = 0; c < w->channels;) {
-        memset(run, 0, bytes);
-        for (size_t end = c + RUN < w->channels ? c + RUN : w->channels; c < end; c++) {
-            w->k->mul(b->n, stage(w, b, 0, x, c), stage(w, b, 1, gy, c), buf);
-            if (part) dar_dtype_set(w->type, part, c, w->k->dot(b->n, buf, r));
-            w->k->axpy(b->n, weight(w, c), buf, run);
-        }
-        w->k->add(b->n, dot, run, dot);
-    }
-}
-
 static char *part_of(const struct walk *w, size_t i)
 {
-    return w->part ? (char *)w->c->scratch + w->part + i * w->channels * dar_dtype_size(w->type) : NULL;
+    return (char *)w->c->scratch + w->part + i * w->part;
 }
 
-/* gx = w gy r - x r^3 / C dot; where the norm is at its least, it is constant and the second part 0. */
+/* gx = w gy r - x r^3 / C Σ w gy x; where the norm is at its least, it is constant and the second part 0.  The gradient
+ * of w comes with it. */
 static void backward_block(void *ctx, size_t i, int thread)
 {
     const struct walk *w = ctx;
-    const dar_tensor *gx = &w->c->gx[X], *aux = &w->c->aux;
-    struct block b = block_of(w, i, thread);
+    const dar_tensor *x = &w->c->x[X], *gy = &w->c->gy, *gx = &w->c->gx[X], *aux = &w->c->aux;
+    struct block b = block_of(w, i);
     double r[DAR_PIECE], q[DAR_PIECE], buf[DAR_PIECE];
     const void *excess = dar_tensor_at(aux, b.clip * w->places + b.first);
+    (void)thread;
 
     scale_of(w, b.n, excess, r);
-    products(w, &b, r, q, part_of(w, i));
-    if (!gx->data) return;
+    w->k->column_sums[x->dtype](w->channels, b.n, w->places, w->c->scratch, place(w, &b, x, 0), place(w, &b, gy, 0), q);
     w->k->relu_back(b.n, excess, q, q);
     for (int power = 0; power < 3; power++) w->k->mul(b.n, q, r, q);
     w->k->scale(b.n, -1 / (double)w->channels, q, q);
     for (size_t c = 0; c < w->channels; c++) {
-        void *to = dar_row_out(w->type, gx->dtype, place(w, &b, gx, c), w->mode, buf), *g = staged(w, &b, 1, c);
-        w->k->mul(b.n, g, r, g);
-        w->k->scale(b.n, weight(w, c), g, g);
-        w->k->mul_add(b.n, staged(w, &b, 0, c), q, g, to);
-        dar_row_put(w->type, to, gx->dtype, place(w, &b, gx, c), b.n, w->mode);
+        void *dst = gx->data ? place(w, &b, gx, c) : NULL, *to = w->mode == DAR_PUT_ADD || !dst ? buf : dst;
+        double sum = w->k->column_back[x->dtype](b.n, weight(w, c), r, q, place(w, &b, x, c), place(w, &b, gy, c), to,
+                                                 w->mode == DAR_PUT_STREAM);
+        if (dst) dar_row_put(w->type, to, gx->dtype, dst, b.n, w->mode);
+        if (w->c->gx[W].data) dar_dtype_set(w->type, part_of(w, i), c, sum);
     }
 }
 
@@ -203,8 +148,9 @@ static void channel_norm_backward(const dar_opctx *c)
     struct walk w = walk_of(c);
     dar_groups all = { .clips = 1, .tokens = tasks(&w), .rows = 1, .chunk = 1 };
     if (c->gx[X].data) w.mode = dar_put_for(dar_tensor_bytes(&c->gx[X]), c->add[X]);
+    convert_weights(&w);
     dar_parallel(tasks(&w), backward_block, &w);
-    if (w.part) dar_groups_combine(&all, w.type, part_of(&w, 0), w.channels, &c->gx[W], c->add[W]);
+    if (c->gx[W].data) dar_groups_combine(&all, w.type, part_of(&w, 0), w.channels, &c->gx[W], c->add[W]);
 }
 
 /* ---------------------------------------------------------------- the op */
