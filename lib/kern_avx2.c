@@ -14,6 +14,7 @@
 typedef __m256 vf;  /* LANES f32 */
 typedef __m256d vd; /* LANES / 2 f64 */
 typedef __m128i vh; /* LANES 16-bit values */
+typedef __m256i vi; /* LANES i32 */
 typedef __m256 vm;  /* a choice per lane */
 
 static inline vf v_load(const float *p)
@@ -56,6 +57,15 @@ static inline vf v_larger(vf x, vf m)
 {
     __m256i a = _mm256_castps_si256(_mm256_andnot_ps(_mm256_set1_ps(-0.0f), x));
     return _mm256_castsi256_ps(_mm256_max_epu32(a, _mm256_castps_si256(m)));
+}
+
+/* The largest lane as unsigned integers. */
+static inline uint32_t v_largest(vf x)
+{
+    __m256i u = _mm256_castps_si256(x);
+    __m128i m = _mm_max_epu32(_mm256_castsi256_si128(u), _mm256_extracti128_si256(u, 1));
+    m = _mm_max_epu32(m, _mm_shuffle_epi32(m, 0x4e));
+    return (uint32_t)_mm_cvtsi128_si32(_mm_max_epu32(m, _mm_shuffle_epi32(m, 0xb1)));
 }
 
 static inline vf v_sqrt(vf x)
@@ -161,6 +171,11 @@ static inline vh h_larger(vh x, vh m)
     return _mm_max_epu16(_mm_and_si128(x, _mm_set1_epi16(0x7fff)), m);
 }
 
+static inline uint16_t h_largest(vh x)
+{
+    return (uint16_t)~_mm_extract_epi16(_mm_minpos_epu16(~x), 0);
+}
+
 static inline vf v_from_bf16(vh h)
 {
     return _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_cvtepu16_epi32(h), 16));
@@ -192,11 +207,14 @@ static inline vf v_from_i8(const int8_t *p)
     return _mm256_cvtepi32_ps(_mm256_cvtepi8_epi32(_mm_loadl_epi64((const void *)p)));
 }
 
-/* LANES whole numbers a - b. */
-static inline vf v_difference(const int32_t *a, const int32_t *b)
+static inline vi i_load(const int32_t *p)
 {
-    return _mm256_cvtepi32_ps(
-        _mm256_sub_epi32(_mm256_loadu_si256((const void *)a), _mm256_loadu_si256((const void *)b)));
+    return _mm256_loadu_si256((const void *)p);
+}
+
+static inline vf v_difference(vi a, vi b)
+{
+    return _mm256_cvtepi32_ps(_mm256_sub_epi32(a, b));
 }
 
 /* Numbers in [-127, 127], to the nearest, as bytes with the bits of `flip` changed. */

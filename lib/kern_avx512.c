@@ -14,6 +14,7 @@
 typedef __m512 vf;    /* LANES f32 */
 typedef __m512d vd;   /* LANES / 2 f64 */
 typedef __m256i vh;   /* LANES 16-bit values */
+typedef __m512i vi;   /* LANES i32 */
 typedef __mmask16 vm; /* a choice per lane */
 
 static inline vf v_load(const float *p)
@@ -55,6 +56,12 @@ static inline vf v_min(vf a, vf b)
 static inline vf v_larger(vf x, vf m)
 {
     return _mm512_castsi512_ps(_mm512_max_epu32(_mm512_castps_si512(_mm512_abs_ps(x)), _mm512_castps_si512(m)));
+}
+
+/* The largest lane as unsigned integers. */
+static inline uint32_t v_largest(vf x)
+{
+    return _mm512_reduce_max_epu32(_mm512_castps_si512(x));
 }
 
 static inline vf v_sqrt(vf x)
@@ -158,21 +165,28 @@ static inline vh h_larger(vh x, vh m)
     return _mm256_max_epu16(_mm256_and_si256(x, _mm256_set1_epi16(0x7fff)), m);
 }
 
+static inline uint16_t h_largest(vh x)
+{
+    __m128i m = _mm_max_epu16(_mm256_castsi256_si128(x), _mm256_extracti128_si256(x, 1));
+    return (uint16_t)~_mm_extract_epi16(_mm_minpos_epu16(~m), 0);
+}
+
 static inline vf v_from_bf16(vh h)
 {
     return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(h), 16));
 }
 
 /* Not VCVTNEPS2BF16: that one flushes denormals.  Half a unit is added, less the last bit where the result is even;
- * NaN, which that would carry into the sign, is rare enough for a branch. */
+ * not to NaN, which it would carry into the sign. */
 static inline vh v_to_bf16(vf x)
 {
     const __m512i high = _mm512_set_epi16(31, 29, 27, 25, 23, 21, 19, 17, 15, 13, 11, 9, 7, 5, 3, 1, 31, 29, 27, 25, 23,
                                           21, 19, 17, 15, 13, 11, 9, 7, 5, 3, 1);
-    __m512i u = _mm512_castps_si512(x), r = _mm512_add_epi32(u, _mm512_set1_epi32(0x7fff));
-    __mmask16 odd = _mm512_test_epi32_mask(u, _mm512_set1_epi32(0x10000)), nan = _mm512_cmp_ps_mask(x, x, _CMP_UNORD_Q);
+    __m512i u = _mm512_castps_si512(x), quiet = _mm512_or_epi32(u, _mm512_set1_epi32(0x400000));
+    __mmask16 number = _mm512_cmp_ps_mask(x, x, _CMP_ORD_Q);
+    __mmask16 odd = _mm512_mask_test_epi32_mask(number, u, _mm512_set1_epi32(0x10000));
+    __m512i r = _mm512_mask_add_epi32(quiet, number, u, _mm512_set1_epi32(0x7fff));
     r = _mm512_mask_sub_epi32(r, odd, r, _mm512_set1_epi32(-1));
-    if (__builtin_expect(nan, 0)) r = _mm512_mask_or_epi32(r, nan, u, _mm512_set1_epi32(0x400000));
     return _mm512_castsi512_si256(_mm512_permutexvar_epi16(high, r));
 }
 
@@ -191,10 +205,14 @@ static inline vf v_from_i8(const int8_t *p)
     return _mm512_cvtepi32_ps(_mm512_cvtepi8_epi32(_mm_loadu_si128((const void *)p)));
 }
 
-/* LANES whole numbers a - b. */
-static inline vf v_difference(const int32_t *a, const int32_t *b)
+static inline vi i_load(const int32_t *p)
 {
-    return _mm512_cvtepi32_ps(_mm512_sub_epi32(_mm512_loadu_si512(a), _mm512_loadu_si512(b)));
+    return _mm512_loadu_si512(p);
+}
+
+static inline vf v_difference(vi a, vi b)
+{
+    return _mm512_cvtepi32_ps(_mm512_sub_epi32(a, b));
 }
 
 /* Numbers in [-127, 127], to the nearest, as bytes with the bits of `flip` changed. */
