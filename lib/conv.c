@@ -1,10 +1,12 @@
-/* conv.c: the virtual operand, and the three products around it. */
+/* conv.c: convolution by the virtual operand col: y and gx with strides, and gw. */
 #include "lib/conv.h"
 
 #include <string.h>
 
-#include "lib/conv_fold.h"
+#include "lib/conv_clip.h"
+#include "lib/conv_slide.h"
 #include "lib/kern.h"
+#include "lib/size.h"
 #include "lib/thread.h"
 #include "lib/tile.h"
 
@@ -15,39 +17,13 @@
 #define LITTLE 96   /* but none with fewer rows: they pay for packing B */
 #define FILL   16   /* rows of col made at a time before they are packed: first-level cache */
 #define BESIDE 16   /* elements between rows of col, so that they do not share their place in the cache */
-#define GROUP  16   /* output channels of w turned at a time; even: whole units */
-#define LANES  48   /* input channels, likewise; whole stripes of every tile */
 #define FLUSH  8192 /* pixels summed in one accumulator before it goes to gw: bounds the error of long sums */
 #define LINE   16   /* columns of gw^T turned at a time: a cache line of f32 */
-
-static size_t least(size_t a, size_t b)
-{
-    return a < b ? a : b;
-}
-
-static size_t most(size_t a, size_t b)
-{
-    return a > b ? a : b;
-}
-
-static size_t blocks_of(size_t n, size_t block)
-{
-    return n / block + (n % block != 0);
-}
-
-/* Length of equal blocks of n: at most `limit`, a multiple of `unit`, and `wanted` of them if none is below `little`.
- */
-static size_t even_block(size_t n, size_t limit, size_t unit, size_t wanted, size_t little)
-{
-    size_t count = most(blocks_of(n, limit), least(wanted, blocks_of(n, little)));
-    return most(blocks_of(blocks_of(n, most(count, 1)), unit), 1) * unit;
-}
 
 /* ---------------------------------------------------------------- the job: what all products share */
 
 struct job {
-    dar_conv c; /* whose col is the virtual operand; for gx that of the mirrored convolution, from y to x */
-    bool mirrored;
+    dar_conv c;
     const dar_tile *tile;
     dar_dtype operand, col, sum;                 /* types of packed operands, of col and of the result */
     size_t taps, K, P;                           /* kt kh kw, Cin taps, To Ho Wo */
@@ -63,11 +39,6 @@ struct room {
     char *a, *b, *c, *col;
 };
 
-static size_t aligned(size_t n)
-{
-    return blocks_of(n, DAR_ALIGN) * DAR_ALIGN;
-}
-
 static size_t own_bytes(const struct job *j)
 {
     return j->a_bytes + j->b_bytes + j->c_bytes + j->col_bytes;
@@ -79,66 +50,38 @@ static struct room room_of(const struct job *j, void *scratch, int thread)
     return (struct room){ p, p + j->a_bytes, p + j->a_bytes + j->b_bytes, p + j->a_bytes + j->b_bytes + j->c_bytes };
 }
 
-static bool unit_strides(const dar_conv *c)
-{
-    return c->stride == 1 && c->stride_t == 1;
-}
-
-/* gx is a convolution of gy with the kernel turned round: taps are counted as in w, and read from the other end. */
-static dar_conv mirror(const dar_conv *c)
-{
-    return (dar_conv){ .B = c->B,
-                       .Cin = c->Cout,
-                       .T = c->To,
-                       .H = c->Ho,
-                       .W = c->Wo,
-                       .Cout = c->Cin,
-                       .kt = c->kt,
-                       .kh = c->kh,
-                       .kw = c->kw,
-                       .stride = 1,
-                       .top = (int64_t)c->kh - 1 - c->top,
-                       .left = (int64_t)c->kw - 1 - c->left,
-                       .stride_t = 1,
-                       .front = (int64_t)(c->kt + c->past) - 1 - c->front,
-                       .To = c->T + c->past,
-                       .Ho = c->H,
-                       .Wo = c->W };
-}
-
-/* y or gx, by pixels: few large tasks or many small ones, A shared by all. */
+/* y, by pixels: few large tasks or many small ones, A shared by all. */
 static void cut_pixels(struct job *j, dar_dtype w)
 {
     const dar_tile *t = j->tile;
     size_t N = j->c.B * j->P, Cout = j->c.Cout;
 
-    j->n = even_block(N, PIXELS, t->nr, TASKS, PIXELS / 2);
-    j->m = even_block(Cout, ROWS, t->mr, blocks_of(TASKS, most(blocks_of(N, j->n), 1)), LITTLE);
+    j->n = dar_even_block(N, PIXELS, t->nr, TASKS, PIXELS / 2);
+    j->m = dar_even_block(Cout, ROWS, t->mr, dar_blocks(TASKS, dar_most(dar_blocks(N, j->n), 1)), LITTLE);
     j->depth = DEPTH;
-    j->packs_a = j->mirrored || w != j->operand || j->K % t->unit; /* else w is read where it lies */
-    if (j->packs_a) j->shared = aligned(blocks_of(Cout, t->mr) * dar_tile_bytes_a(t, j->K));
-    j->col_bytes =
-        aligned(most(FILL * (j->n + BESIDE) * dar_dtype_size(j->col), LANES * GROUP * j->taps * dar_dtype_size(w)));
+    j->packs_a = w != j->operand || j->K % t->unit; /* else w is read where it lies */
+    if (j->packs_a) j->shared = dar_round_up(dar_blocks(Cout, t->mr) * dar_tile_bytes_a(t, j->K), DAR_ALIGN);
+    j->col_bytes = dar_round_up(FILL * (j->n + BESIDE) * dar_dtype_size(j->col), DAR_ALIGN);
 }
 
 /* gcol, by channels of x: a task adds to its channels alone. */
 static void cut_channels(struct job *j)
 {
-    size_t wide = even_block(j->c.Cin, most(ROWS / j->taps, 1), 1, blocks_of(TASKS, most(j->c.B, 1)), 1);
-    j->n = even_block(j->P, PIXELS, j->tile->nr, 1, 1);
+    size_t wide = dar_even_block(j->c.Cin, dar_most(ROWS / j->taps, 1), 1, dar_blocks(TASKS, dar_most(j->c.B, 1)), 1);
+    j->n = dar_even_block(j->P, PIXELS, j->tile->nr, 1, 1);
     j->m = wide * j->taps;
     j->depth = DEPTH;
-    j->a_bytes = aligned(blocks_of(j->m, j->tile->mr) * dar_tile_bytes_a(j->tile, j->c.Cout));
+    j->a_bytes = dar_round_up(dar_blocks(j->m, j->tile->mr) * dar_tile_bytes_a(j->tile, j->c.Cout), DAR_ALIGN);
 }
 
 /* gw^T, by blocks: a task sums over all pixels. */
 static void cut_weights(struct job *j)
 {
-    j->n = even_block(j->c.Cout, PIXELS, j->tile->nr, 1, 1);
-    j->m = even_block(j->K, ROWS, j->tile->mr, blocks_of(TASKS, blocks_of(j->c.Cout, j->n)), 2 * LITTLE);
+    j->n = dar_even_block(j->c.Cout, PIXELS, j->tile->nr, 1, 1);
+    j->m = dar_even_block(j->K, ROWS, j->tile->mr, dar_blocks(TASKS, dar_blocks(j->c.Cout, j->n)), 2 * LITTLE);
     j->depth = PIXELS;
-    j->a_bytes = aligned(j->m * j->depth * dar_dtype_size(j->operand));
-    j->col_bytes = aligned(LINE * (j->m + LINE) * dar_dtype_size(j->sum));
+    j->a_bytes = dar_round_up(j->m * j->depth * dar_dtype_size(j->operand), DAR_ALIGN);
+    j->col_bytes = dar_round_up(LINE * (j->m + LINE) * dar_dtype_size(j->sum), DAR_ALIGN);
 }
 
 static struct job job_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_dtype w)
@@ -147,24 +90,56 @@ static struct job job_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar
     dar_tile_kind kind = dar_tile_kind_for(x == DAR_BF16 && w != DAR_BF16 ? DAR_F32 : x);
     struct job j = { .c = *c, .operand = of[kind], .sum = dar_compute_type(x), .taps = c->kt * c->kh * c->kw };
 
-    j.mirrored = pass == DAR_CONV_BACK_X && unit_strides(c);
-    if (j.mirrored) j.c = mirror(c);
     j.col = pass == DAR_CONV_FORWARD ? x : pass == DAR_CONV_BACK_X ? j.sum : j.operand;
     j.K = j.c.Cin * j.taps;
     j.P = j.c.To * j.c.Ho * j.c.Wo;
     j.tile = dar_tile_for(kind, pass == DAR_CONV_BACK_W ? c->Cout : c->B * j.P);
-    if (pass == DAR_CONV_FORWARD || j.mirrored) cut_pixels(&j, w);
+    if (pass == DAR_CONV_FORWARD) cut_pixels(&j, w);
     else if (pass == DAR_CONV_BACK_X) cut_channels(&j);
     else cut_weights(&j);
-    j.b_bytes = aligned((blocks_of(j.n, j.tile->nr) * j.tile->nr + BESIDE) * dar_tile_units(j.tile, j.depth) *
-                        j.tile->unit_bytes);
-    j.c_bytes = aligned(j.m * j.n * dar_dtype_size(j.sum));
+    j.b_bytes = dar_round_up((dar_blocks(j.n, j.tile->nr) * j.tile->nr + BESIDE) * dar_tile_units(j.tile, j.depth) *
+                                 j.tile->unit_bytes,
+                             DAR_ALIGN);
+    j.c_bytes = dar_round_up(j.m * j.n * dar_dtype_size(j.sum), DAR_ALIGN);
     return j;
+}
+
+/* Without col, where strides are 1: gx is a convolution of gy with the kernel turned round. */
+static dar_conv_slide slide_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_dtype w)
+{
+    dar_conv_slide s = { .c = *c, .turned = pass == DAR_CONV_BACK_X, .x_type = x, .w_type = w };
+    if (s.turned)
+        s.c = (dar_conv){ .B = c->B,
+                          .Cin = c->Cout,
+                          .T = c->To,
+                          .H = c->Ho,
+                          .W = c->Wo,
+                          .Cout = c->Cin,
+                          .kt = c->kt,
+                          .kh = c->kh,
+                          .kw = c->kw,
+                          .stride = 1,
+                          .top = (int64_t)c->kh - 1 - c->top,
+                          .left = (int64_t)c->kw - 1 - c->left,
+                          .stride_t = 1,
+                          .front = (int64_t)(c->kt + c->past) - 1 - c->front,
+                          .To = c->T + c->past,
+                          .Ho = c->H,
+                          .Wo = c->W };
+    return s;
+}
+
+static bool slides(const dar_conv *c, dar_conv_pass pass)
+{
+    return pass != DAR_CONV_BACK_W && c->stride == 1 && c->stride_t == 1;
 }
 
 size_t dar_conv_scratch(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_dtype w, int threads)
 {
-    if (pass == DAR_CONV_FORWARD && dar_conv_fold_fits(c)) return dar_conv_fold_scratch(c, x, w, threads);
+    if (slides(c, pass)) {
+        dar_conv_slide s = slide_of(c, pass, x, w);
+        return dar_conv_slide_scratch(&s, threads);
+    }
     struct job j = job_of(c, pass, x, w);
     return j.shared + (size_t)threads * own_bytes(&j);
 }
@@ -195,27 +170,10 @@ static void multiply(const struct job *j, struct lhs a, struct rhs b, size_t m, 
     for (size_t i = 0; i < m; i += t->mr, a.data += a.stripe * t->unit_bytes)
         for (size_t q = 0; q < n; q += t->nr)
             t->mm(units, a.data, a.row, a.step, b.data + q / t->nr * b.stripe * t->unit_bytes, b.step,
-                  c + (i * j->n + q) * size, j->n, least(t->mr, m - i), least(t->nr, n - q), add);
+                  c + (i * j->n + q) * size, j->n, dar_least(t->mr, m - i), dar_least(t->nr, n - q), add);
 }
 
 /* ---------------------------------------------------------------- rows of col */
-
-/* Channels by frames of x and of history before it; a frame that is nowhere is zero. */
-struct clip {
-    const dar_tensor *x, *past;
-    size_t C, T, P; /* T frames in x, P in past */
-    size_t plane;   /* pixels of a frame */
-};
-
-static char *frame_of(const struct clip *v, size_t b, size_t c, int64_t t, dar_dtype *type)
-{
-    const dar_tensor *of = t < 0 ? v->past : v->x;
-    size_t frames = t < 0 ? v->P : v->T;
-    if (t < 0) t += (int64_t)v->P;
-    if (t < 0 || (size_t)t >= frames || !of->data) return NULL;
-    *type = of->dtype;
-    return (char *)of->data + ((b * v->C + c) * frames + (size_t)t) * v->plane * dar_dtype_size(of->dtype);
-}
 
 /* One row of col: input channel ci, and how far from an output pixel (t, h, w), times the stride, it reads. */
 struct tap {
@@ -229,14 +187,13 @@ static size_t columns_before(const dar_conv *c, int64_t to, int64_t dx)
 {
     if (to <= dx) return 0;
     size_t n = (size_t)(to - dx);
-    return least(c->stride == 1 ? n : blocks_of(n, c->stride), c->Wo);
+    return dar_least(c->stride == 1 ? n : dar_blocks(n, c->stride), c->Wo);
 }
 
 static struct tap tap_of(const struct job *j, size_t k)
 {
     const dar_conv *c = &j->c;
     size_t tap = k % j->taps;
-    if (j->mirrored) tap = j->taps - 1 - tap;
     struct tap e = { k / j->taps,
                      (int64_t)(tap / c->kw / c->kh) - c->front,
                      (int64_t)(tap / c->kw % c->kh) - c->top,
@@ -268,14 +225,8 @@ static void next_frame(const dar_conv *c, struct at *p)
 
 /* A run of output pixels of one frame, row by row. */
 #define EACH_ROW(c, p, n, length)                                                                                      \
-    for (size_t length = least((c)->Wo - (p).w, n); n; n -= length, (p).w = 0, (p).h++, length = least((c)->Wo, n))
-
-static void zero(char *dst, size_t n, size_t size)
-{
-    if (n == 1 && size == 4) *(uint32_t *)(void *)dst = 0; /* the usual border */
-    else if (n == 1 && size == 2) *(uint16_t *)(void *)dst = 0;
-    else if (n) memset(dst, 0, n * size);
-}
+    for (size_t length = dar_least((c)->Wo - (p).w, n); n;                                                             \
+         n -= length, (p).w = 0, (p).h++, length = dar_least((c)->Wo, n))
 
 /* n pixels of one frame where output and input rows are equally long and dense: one shifted copy, then the columns that
  * it took from neighbouring rows. */
@@ -284,21 +235,21 @@ static void fill_shifted(const struct job *j, const struct tap *e, struct at p, 
 {
     const dar_conv *c = &j->c;
     int64_t at = ((int64_t)p.h + e->dy) * (int64_t)c->W + (int64_t)p.w + e->dx, end = (int64_t)(c->H * c->W);
-    size_t size = dar_dtype_size(j->col), low = at < 0 ? least((size_t)-at, n) : 0;
-    size_t high = at >= end ? low : most(low, least(n, (size_t)(end - at)));
+    size_t size = dar_dtype_size(j->col), low = at < 0 ? dar_least((size_t)-at, n) : 0;
+    size_t high = at >= end ? low : dar_most(low, dar_least(n, (size_t)(end - at)));
 
-    zero(dst, low, size);
+    dar_clip_zero(dst, low, size);
     if (high > low)
         dar_row_convert(j->col, dst + low * size, type, frame + (at + (int64_t)low) * (int64_t)dar_dtype_size(type),
                         high - low);
-    zero(dst + high * size, n - high, size);
+    dar_clip_zero(dst + high * size, n - high, size);
     if (e->first == 0 && e->last == c->Wo) return;
     EACH_ROW(c, p, n, length)
     {
-        if (p.w < e->first) zero(dst, least(e->first - p.w, length), size);
+        if (p.w < e->first) dar_clip_zero(dst, dar_least(e->first - p.w, length), size);
         if (p.w + length > e->last) {
-            size_t from = most(e->last, p.w) - p.w;
-            zero(dst + from * size, length - from, size);
+            size_t from = dar_most(e->last, p.w) - p.w;
+            dar_clip_zero(dst + from * size, length - from, size);
         }
         dst += length * size;
     }
@@ -315,17 +266,17 @@ static void fill_rows(const struct job *j, const struct tap *e, struct at p, siz
     {
         int64_t row = (int64_t)(p.h * c->stride) + e->dy;
         bool inside = row >= 0 && row < (int64_t)c->H;
-        size_t low = most(e->first, p.w), high = least(e->last, p.w + length);
+        size_t low = dar_most(e->first, p.w), high = dar_least(e->last, p.w + length);
         if (!inside || low >= high) {
-            zero(dst, length, size);
+            dar_clip_zero(dst, length, size);
         } else {
             const char *src = frame + (row * (int64_t)c->W + (int64_t)(low * c->stride) + e->dx) * (int64_t)from;
-            zero(dst, low - p.w, size);
+            dar_clip_zero(dst, low - p.w, size);
             if (c->stride == 1) dar_row_convert(j->col, dst + (low - p.w) * size, type, src, high - low);
             else
                 for (size_t i = low; i < high; i++, src += c->stride * from)
                     dar_row_convert(j->col, dst + (i - p.w) * size, type, src, 1);
-            zero(dst + (high - p.w) * size, p.w + length - high, size);
+            dar_clip_zero(dst + (high - p.w) * size, p.w + length - high, size);
         }
         dst += length * size;
     }
@@ -341,40 +292,40 @@ static void ahead(const struct job *j, const struct tap *e, const struct at *p, 
 }
 
 /* n pixels of a row of col from pixel p. */
-static void fill_row(const struct job *j, const struct tap *e, struct at p, size_t n, const struct clip *v, char *dst)
+static void fill_row(const struct job *j, const struct tap *e, struct at p, size_t n, const dar_clip *v, char *dst)
 {
     const dar_conv *c = &j->c;
     size_t size = dar_dtype_size(j->col);
 
     for (size_t m; n; n -= m, dst += m * size, next_frame(c, &p)) {
-        m = least(n, (c->Ho - p.h) * c->Wo - p.w);
+        m = dar_least(n, (c->Ho - p.h) * c->Wo - p.w);
         dar_dtype type;
-        const char *frame = frame_of(v, p.b, e->ci, (int64_t)(p.t * c->stride_t) + e->dt, &type);
+        const char *frame = dar_clip_frame(v, p.b, e->ci, (int64_t)(p.t * c->stride_t) + e->dt, &type);
         if (frame && e->dx == 0 && e->ci + 1 < v->C)
             ahead(j, e, &p, m, type, frame + v->T * v->plane * dar_dtype_size(type));
-        if (!frame) zero(dst, m, size);
+        if (!frame) dar_clip_zero(dst, m, size);
         else if (c->stride == 1 && c->W == c->Wo) fill_shifted(j, e, p, m, type, frame, dst);
         else fill_rows(j, e, p, m, type, frame, dst);
     }
 }
 
 /* The reverse: add n pixels of a row of gcol to where they came from. */
-static void spill_row(const struct job *j, const struct tap *e, struct at p, size_t n, const struct clip *v,
+static void spill_row(const struct job *j, const struct tap *e, struct at p, size_t n, const dar_clip *v,
                       const char *src)
 {
     const dar_conv *c = &j->c;
     size_t size = dar_dtype_size(j->sum);
 
     for (size_t m; n; n -= m, next_frame(c, &p)) {
-        m = least(n, (c->Ho - p.h) * c->Wo - p.w);
+        m = dar_least(n, (c->Ho - p.h) * c->Wo - p.w);
         dar_dtype type;
-        char *frame = frame_of(v, p.b, e->ci, (int64_t)(p.t * c->stride_t) + e->dt, &type);
+        char *frame = dar_clip_frame(v, p.b, e->ci, (int64_t)(p.t * c->stride_t) + e->dt, &type);
         struct at r = p;
         size_t left = m;
         EACH_ROW(c, r, left, length)
         {
             int64_t row = (int64_t)(r.h * c->stride) + e->dy;
-            size_t low = most(e->first, r.w), high = least(e->last, r.w + length);
+            size_t low = dar_most(e->first, r.w), high = dar_least(e->last, r.w + length);
             const char *from = src - r.w * size;
             src += length * size;
             if (!frame || row < 0 || row >= (int64_t)c->H) continue;
@@ -387,18 +338,17 @@ static void spill_row(const struct job *j, const struct tap *e, struct at p, siz
     }
 }
 
-/* ---------------------------------------------------------------- y, and gx where strides are 1 */
+/* ---------------------------------------------------------------- y */
 
-struct correlate {
+struct forward {
     struct job j;
-    struct clip in, out;
-    bool add, add_past;
-    const dar_tensor *w, *b; /* b NULL or without data: none */
+    dar_clip x;
+    const dar_tensor *w, *b, *y; /* b may have no data */
     char *scratch;
 };
 
 /* B: rows k0.. of col at pixels q0...  Packed; or, where a unit is one element of col, row by row as they are. */
-static struct rhs make_col(const struct correlate *f, size_t q0, size_t n, size_t k0, size_t k, const struct room *r)
+static struct rhs make_col(const struct forward *f, size_t q0, size_t n, size_t k0, size_t k, const struct room *r)
 {
     const struct job *j = &f->j;
     const dar_tile *t = j->tile;
@@ -408,60 +358,53 @@ static struct rhs make_col(const struct correlate *f, size_t q0, size_t n, size_
     struct at p = at_of(&j->c, q0);
 
     for (size_t i = 0; i < k; i += FILL) {
-        size_t m = least(FILL, k - i);
+        size_t m = dar_least(FILL, k - i);
         char *rows = as_is ? r->b + i * ld * size : r->col;
         for (size_t u = 0; u < m; u++) {
             struct tap e = tap_of(j, k0 + i + u);
-            fill_row(j, &e, p, n, &f->in, rows + u * ld * size);
+            fill_row(j, &e, p, n, &f->x, rows + u * ld * size);
         }
         for (size_t q = 0; q < n && !as_is; q += t->nr)
-            dar_tile_pack_b_kn(t, j->col, rows + q * size, ld, m, least(t->nr, n - q),
+            dar_tile_pack_b_kn(t, j->col, rows + q * size, ld, m, dar_least(t->nr, n - q),
                                r->b + (q / t->nr * b.stripe + i / t->unit * t->nr) * t->unit_bytes);
     }
     return b;
 }
 
-/* Rows o0.., pixels q0.. of the output = c + b.  A channel's pixels are dense in past and in x. */
-static void store(const struct correlate *f, size_t o0, size_t m, size_t q0, size_t n, char *c)
+/* Rows o0.., pixels q0.. of y = c + b. */
+static void store(const struct forward *f, size_t o0, size_t m, size_t q0, size_t n, char *c)
 {
     const struct job *j = &f->j;
-    const struct clip *v = &f->out;
     const dar_kern *k = dar_kern_for(j->sum);
-    size_t size = dar_dtype_size(j->sum), past = v->P * v->plane;
-    dar_put mode = dar_put_for(v->x->data ? dar_tensor_bytes(v->x) : 0, f->add);
-    dar_put mode_past = f->add_past ? DAR_PUT_ADD : DAR_PUT;
+    size_t size = dar_dtype_size(j->sum);
+    dar_put mode = dar_put_for(dar_tensor_bytes(f->y), false);
 
     for (size_t o = 0; o < m; o++) {
         char *row = c + o * j->n * size;
-        double bias = f->b && f->b->data ? dar_dtype_get(f->b->dtype, f->b->data, o0 + o) : 0;
-        if (f->b && f->b->data) k->offset(n, bias, row, row);
+        if (f->b->data) k->offset(n, dar_dtype_get(f->b->dtype, f->b->data, o0 + o), row, row);
         for (size_t i = 0, length; i < n; i += length) {
-            size_t batch = (q0 + i) / j->P, p = (q0 + i) % j->P;
-            bool before = p < past;
-            const dar_tensor *to = before ? v->past : v->x;
-            length = least(n - i, (before ? past : j->P) - p);
-            if (!to->data) continue;
-            size_t at = (batch * v->C + o0 + o) * (before ? past : j->P - past) + (before ? p : p - past);
-            dar_row_put(j->sum, row + i * size, to->dtype, (char *)to->data + at * dar_dtype_size(to->dtype), length,
-                        before ? mode_past : mode);
+            size_t batch = (q0 + i) / j->P, p = (q0 + i) % j->P, at = (batch * j->c.Cout + o0 + o) * j->P + p;
+            length = dar_least(n - i, j->P - p);
+            dar_row_put(j->sum, row + i * size, f->y->dtype, (char *)f->y->data + at * dar_dtype_size(f->y->dtype),
+                        length, mode);
         }
     }
 }
 
-static void correlate_task(void *ctx, size_t i, int thread)
+static void forward_task(void *ctx, size_t i, int thread)
 {
-    const struct correlate *f = ctx;
+    const struct forward *f = ctx;
     const struct job *j = &f->j;
     const dar_tile *t = j->tile;
-    size_t down = blocks_of(j->c.Cout, j->m), o0 = i % down * j->m, q0 = i / down * j->n;
-    size_t m = least(j->m, j->c.Cout - o0), n = least(j->n, j->c.B * j->P - q0);
+    size_t down = dar_blocks(j->c.Cout, j->m), o0 = i % down * j->m, q0 = i / down * j->n;
+    size_t m = dar_least(j->m, j->c.Cout - o0), n = dar_least(j->n, j->c.B * j->P - q0);
     struct room r = room_of(j, f->scratch, thread);
     struct lhs a = { f->scratch, 1, t->mr, dar_tile_units(t, j->K) * t->mr };
 
     if (!j->packs_a) a = (struct lhs){ f->w->data, j->K / t->unit, 1, j->K / t->unit * t->mr };
     a.data += o0 / t->mr * a.stripe * t->unit_bytes;
     for (size_t k = 0; k < j->K; k += j->depth) {
-        size_t depth = least(j->depth, j->K - k);
+        size_t depth = dar_least(j->depth, j->K - k);
         struct rhs b = make_col(f, q0, n, k, depth, &r);
         multiply(j, a, b, m, n, depth, r.c, k > 0);
         a.data += depth / t->unit * a.step * t->unit_bytes;
@@ -469,75 +412,44 @@ static void correlate_task(void *ctx, size_t i, int thread)
     store(f, o0, m, q0, n, r.c);
 }
 
-/* Stripes of w for gx from c0: row i is input channel c0 + i, column o taps + tap is w[o, c0 + i, tap]. */
-static void turn_weights(const struct correlate *f, size_t c0, size_t lanes, char *dst, char *buf)
-{
-    const struct job *j = &f->j;
-    const dar_tile *t = j->tile;
-    size_t size = dar_dtype_size(f->w->dtype), run = j->taps * size, row = GROUP * run;
-
-    for (size_t o = 0; o < j->c.Cin; o += GROUP) {
-        size_t n = least(GROUP, j->c.Cin - o);
-        for (size_t u = 0; u < n; u++) {
-            const char *src = (char *)f->w->data + ((o + u) * j->c.Cout + c0) * run;
-            for (size_t i = 0; i < lanes; i++) memcpy(buf + i * row + u * run, src + i * run, run);
-        }
-        for (size_t i = 0; i < lanes; i += t->mr)
-            dar_tile_pack_a_mk(t, f->w->dtype, buf + i * row, GROUP * j->taps, least(t->mr, lanes - i), n * j->taps,
-                               dst + i / t->mr * dar_tile_bytes_a(t, j->K) +
-                                   o * j->taps / t->unit * t->mr * t->unit_bytes);
-    }
-}
-
 static void pack_weights(void *ctx, size_t begin, size_t end, int thread)
 {
-    const struct correlate *f = ctx;
+    const struct forward *f = ctx;
     const struct job *j = &f->j;
-    const dar_tile *t = j->tile;
-    size_t row = j->K * dar_dtype_size(f->w->dtype), stripe = dar_tile_bytes_a(t, j->K);
-
-    if (j->mirrored)
-        turn_weights(f, begin, end - begin, f->scratch + begin / t->mr * stripe, room_of(j, f->scratch, thread).col);
-    else
-        for (size_t o = begin; o < end; o += t->mr)
-            dar_tile_pack_a_mk(t, f->w->dtype, (char *)f->w->data + o * row, j->K, least(t->mr, end - o), j->K,
-                               f->scratch + o / t->mr * stripe);
+    size_t row = j->K * dar_dtype_size(f->w->dtype);
+    (void)thread;
+    dar_tile_pack_a_mk(j->tile, f->w->dtype, (char *)f->w->data + begin * row, j->K, end - begin, j->K,
+                       f->scratch + begin / j->tile->mr * dar_tile_bytes_a(j->tile, j->K));
 }
 
-static void correlate(struct correlate *f)
+static dar_clip clip_of(const dar_conv *c, const dar_tensor *x, const dar_tensor *past)
 {
-    const struct job *j = &f->j;
-    size_t N = j->c.B * j->P;
-    if (j->packs_a && N) dar_parallel_range(j->c.Cout, LANES, pack_weights, f);
-    dar_parallel(blocks_of(j->c.Cout, j->m) * blocks_of(N, j->n), correlate_task, f);
-}
-
-static struct clip clip_of(const dar_conv *c, const dar_tensor *x, const dar_tensor *past)
-{
-    return (struct clip){ x, past, c->Cin, c->T, c->past, c->H * c->W };
+    return (dar_clip){ x, past, c->Cin, c->T, c->past, c->H * c->W };
 }
 
 static const dar_tensor none;
 
-static struct clip clip_of_y(const dar_conv *c, const dar_tensor *y)
+static dar_clip clip_of_y(const dar_conv *c, const dar_tensor *y)
 {
-    return (struct clip){ y, &none, c->Cout, c->To, 0, c->Ho * c->Wo };
+    return (dar_clip){ y, &none, c->Cout, c->To, 0, c->Ho * c->Wo };
 }
 
 void dar_conv_forward(const dar_conv *c, const dar_tensor *x, const dar_tensor *w, const dar_tensor *b,
                       const dar_tensor *history, const dar_tensor *y, void *scratch)
 {
-    if (dar_conv_fold_fits(c)) { /* few channels */
-        dar_conv_fold_forward(c, x, w, b, history, y, scratch);
+    if (slides(c, DAR_CONV_FORWARD)) {
+        dar_conv_slide s = slide_of(c, DAR_CONV_FORWARD, x->dtype, w->dtype);
+        s.in = clip_of(c, x, history);
+        s.out = clip_of_y(c, y);
+        s.w = w, s.b = b;
+        dar_conv_slide_run(&s, scratch);
         return;
     }
-    struct correlate f = { .j = job_of(c, DAR_CONV_FORWARD, x->dtype, w->dtype),
-                           .in = clip_of(c, x, history),
-                           .out = clip_of_y(c, y),
-                           .w = w,
-                           .b = b,
-                           .scratch = scratch };
-    correlate(&f);
+    struct forward f = { job_of(c, DAR_CONV_FORWARD, x->dtype, w->dtype), clip_of(c, x, history), w, b, y, scratch };
+    const struct job *j = &f.j;
+    size_t N = c->B * j->P;
+    if (j->packs_a && N) dar_parallel_range(c->Cout, j->tile->mr, pack_weights, &f);
+    dar_parallel(dar_blocks(c->Cout, j->m) * dar_blocks(N, j->n), forward_task, &f);
 }
 
 /* ---------------------------------------------------------------- gx for any stride */
@@ -545,12 +457,12 @@ void dar_conv_forward(const dar_conv *c, const dar_tensor *x, const dar_tensor *
 struct back_x {
     struct job j;
     const dar_tensor *w, *gy;
-    struct clip gx;
+    dar_clip gx;
     bool add, add_past;
     char *scratch;
 };
 
-static void clear(const struct clip *v, const dar_tensor *g, size_t frames, size_t batch, size_t c0, size_t n)
+static void clear(const dar_clip *v, const dar_tensor *g, size_t frames, size_t batch, size_t c0, size_t n)
 {
     size_t channel = frames * v->plane * (g->data ? dar_dtype_size(g->dtype) : 0);
     if (channel) memset((char *)g->data + (batch * v->C + c0) * channel, 0, n * channel);
@@ -562,23 +474,24 @@ static void back_x_task(void *ctx, size_t i, int thread)
     const struct back_x *f = ctx;
     const struct job *j = &f->j;
     const dar_tile *t = j->tile;
-    size_t Cout = j->c.Cout, wide = j->m / j->taps, across = blocks_of(j->c.Cin, wide);
-    size_t batch = i / across, c0 = i % across * wide, channels = least(wide, j->c.Cin - c0), m = channels * j->taps;
+    size_t Cout = j->c.Cout, wide = j->m / j->taps, across = dar_blocks(j->c.Cin, wide);
+    size_t batch = i / across, c0 = i % across * wide, channels = dar_least(wide, j->c.Cin - c0),
+           m = channels * j->taps;
     size_t ws = dar_dtype_size(f->w->dtype), gs = dar_dtype_size(f->gy->dtype), ss = dar_dtype_size(j->sum);
     struct room r = room_of(j, f->scratch, thread);
 
     if (!f->add) clear(&f->gx, f->gx.x, f->gx.T, batch, c0, channels);
     if (!f->add_past) clear(&f->gx, f->gx.past, f->gx.P, batch, c0, channels);
     for (size_t k = 0; k < m; k += t->mr)
-        dar_tile_pack_a_km(t, f->w->dtype, (char *)f->w->data + (c0 * j->taps + k) * ws, j->K, least(t->mr, m - k),
+        dar_tile_pack_a_km(t, f->w->dtype, (char *)f->w->data + (c0 * j->taps + k) * ws, j->K, dar_least(t->mr, m - k),
                            Cout, r.a + k / t->mr * dar_tile_bytes_a(t, Cout));
     for (size_t p = 0; p < j->P; p += j->n) {
-        size_t n = least(j->n, j->P - p);
+        size_t n = dar_least(j->n, j->P - p);
         for (size_t o = 0; o < Cout; o += j->depth) {
-            size_t depth = least(j->depth, Cout - o);
+            size_t depth = dar_least(j->depth, Cout - o);
             const char *gy = (char *)f->gy->data + ((batch * Cout + o) * j->P + p) * gs;
             for (size_t q = 0; q < n; q += t->nr)
-                dar_tile_pack_b_kn(t, f->gy->dtype, gy + q * gs, j->P, depth, least(t->nr, n - q),
+                dar_tile_pack_b_kn(t, f->gy->dtype, gy + q * gs, j->P, depth, dar_least(t->nr, n - q),
                                    r.b + q / t->nr * dar_tile_bytes_b(t, j->depth));
             struct lhs a = { r.a + o / t->unit * t->mr * t->unit_bytes, 1, t->mr, dar_tile_units(t, Cout) * t->mr };
             multiply(j, a, packed_rhs(j, r.b), m, n, depth, r.c, o > 0);
@@ -593,22 +506,25 @@ static void back_x_task(void *ctx, size_t i, int thread)
 void dar_conv_back_x(const dar_conv *c, dar_dtype x_type, const dar_tensor *w, const dar_tensor *gy,
                      const dar_tensor *gx, bool add, const dar_tensor *ghistory, bool add_history, void *scratch)
 {
-    struct job j = job_of(c, DAR_CONV_BACK_X, x_type, w->dtype);
-    struct clip out = clip_of(c, gx, ghistory);
-    if (j.mirrored) {
-        struct correlate f = { j, clip_of_y(c, gy), out, add, add_history, w, NULL, scratch };
-        correlate(&f);
-    } else {
-        struct back_x f = { j, w, gy, out, add, add_history, scratch };
-        dar_parallel(c->B * blocks_of(c->Cin, j.m / j.taps), back_x_task, &f);
+    if (slides(c, DAR_CONV_BACK_X)) {
+        dar_conv_slide s = slide_of(c, DAR_CONV_BACK_X, x_type, w->dtype);
+        s.in = clip_of_y(c, gy);
+        s.out = clip_of(c, gx, ghistory);
+        s.w = w, s.add = add, s.add_past = add_history;
+        dar_conv_slide_run(&s, scratch);
+        return;
     }
+    struct back_x f = {
+        job_of(c, DAR_CONV_BACK_X, x_type, w->dtype), w, gy, clip_of(c, gx, ghistory), add, add_history, scratch
+    };
+    dar_parallel(c->B * dar_blocks(c->Cin, f.j.m / f.j.taps), back_x_task, &f);
 }
 
 /* ---------------------------------------------------------------- gw, gb */
 
 struct back_w {
     struct job j;
-    struct clip x;
+    dar_clip x;
     const dar_tensor *gy, *gw;
     bool add;
     char *scratch;
@@ -621,7 +537,7 @@ static void store_gw(const struct back_w *f, size_t k0, size_t m, size_t o0, siz
     size_t ld = j->m + LINE; /* not a power of two: the rows would share their place in the cache */
 
     for (size_t o = 0; o < n; o += LINE) {
-        size_t lines = least(LINE, n - o);
+        size_t lines = dar_least(LINE, n - o);
         for (size_t k = 0; k < m; k++)
             for (size_t u = 0; u < lines; u++)
                 if (j->sum == DAR_F64)
@@ -646,7 +562,7 @@ static void fill_col(const struct back_w *f, size_t k0, size_t m, size_t q, size
     for (size_t k = 0; k < m; k++, a += j->depth * size) {
         struct tap e = tap_of(j, k0 + k);
         fill_row(j, &e, p, n, &f->x, a);
-        zero(a + n * size, pad, size);
+        dar_clip_zero(a + n * size, pad, size);
         if (k < rows) dar_row_ahead(gy + k * j->P * dar_dtype_size(f->gy->dtype), bytes);
     }
 }
@@ -656,21 +572,22 @@ static void back_w_task(void *ctx, size_t i, int thread)
     const struct back_w *f = ctx;
     const struct job *j = &f->j;
     const dar_tile *t = j->tile;
-    size_t Cout = j->c.Cout, across = blocks_of(Cout, j->n), o0 = i % across * j->n, k0 = i / across * j->m;
-    size_t m = least(j->m, j->K - k0), n = least(j->n, Cout - o0), gs = dar_dtype_size(f->gy->dtype), summed = 0;
+    size_t Cout = j->c.Cout, across = dar_blocks(Cout, j->n), o0 = i % across * j->n, k0 = i / across * j->m;
+    size_t m = dar_least(j->m, j->K - k0), n = dar_least(j->n, Cout - o0), gs = dar_dtype_size(f->gy->dtype),
+           summed = 0;
     struct room r = room_of(j, f->scratch, thread);
     struct lhs a = { r.a, j->depth / t->unit, 1, j->depth / t->unit * t->mr };
     bool add = f->add;
 
     for (size_t batch = 0; batch < j->c.B; batch++)
         for (size_t p = 0; p < j->P; p += j->depth) {
-            size_t depth = least(j->depth, j->P - p);
+            size_t depth = dar_least(j->depth, j->P - p);
             const char *gy = (char *)f->gy->data + ((batch * Cout + o0) * j->P + p) * gs;
             for (size_t q = 0; q < n; q += t->nr)
-                dar_tile_pack_b_nk(t, f->gy->dtype, gy + q * j->P * gs, j->P, depth, least(t->nr, n - q),
+                dar_tile_pack_b_nk(t, f->gy->dtype, gy + q * j->P * gs, j->P, depth, dar_least(t->nr, n - q),
                                    r.b + q / t->nr * dar_tile_bytes_b(t, j->depth));
             fill_col(f, k0, m, batch * j->P + p, depth, r.a, gy + depth * gs, n,
-                     least(j->depth, j->P - p - depth) * gs);
+                     dar_least(j->depth, j->P - p - depth) * gs);
             multiply(j, a, packed_rhs(j, r.b), m, n, depth, r.c, summed > 0);
             summed += depth;
             if (summed < FLUSH && (p + depth < j->P || batch + 1 < j->c.B)) continue;
@@ -684,7 +601,7 @@ void dar_conv_back_w(const dar_conv *c, const dar_tensor *x, const dar_tensor *h
                      const dar_tensor *gy, const dar_tensor *gw, bool add, void *scratch)
 {
     struct back_w f = { job_of(c, DAR_CONV_BACK_W, x->dtype, w_type), clip_of(c, x, history), gy, gw, add, scratch };
-    dar_parallel(blocks_of(f.j.K, f.j.m) * blocks_of(c->Cout, f.j.n), back_w_task, &f);
+    dar_parallel(dar_blocks(f.j.K, f.j.m) * dar_blocks(c->Cout, f.j.n), back_w_task, &f);
 }
 
 struct back_b {

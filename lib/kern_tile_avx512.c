@@ -29,6 +29,10 @@ TILE_BESIDE(mm_6x64_beside, 6, 4)
 TILE_BESIDE(mm_8x48_beside, 8, 3)
 TILE_BESIDE(mm_12x32_beside, 12, 2)
 TILE_BESIDE(mm_12x16_beside, 12, 1)
+TILE_TAPS(mm_6x64_taps, 6, 4)
+TILE_TAPS(mm_8x48_taps, 8, 3)
+TILE_TAPS(mm_12x32_taps, 12, 2)
+TILE_TAPS(mm_12x16_taps, 12, 1)
 
 static inline units along_f32(const void *p, size_t n)
 {
@@ -60,9 +64,9 @@ static const dar_packers pack = {
 };
 
 static const dar_tile of[] = {
-    { "f32 6x64 avx512", DAR_TILE_F32, 1, 4, 6, 64, mm_6x64, &pack, mm_6x64_beside },
-    { "f32 8x48 avx512", DAR_TILE_F32, 1, 4, 8, 48, mm_8x48, &pack, mm_8x48_beside },
-    { "f32 12x32 avx512", DAR_TILE_F32, 1, 4, 12, 32, mm_12x32, &pack, mm_12x32_beside },
-    { "f32 12x16 avx512", DAR_TILE_F32, 1, 4, 12, 16, mm_12x16, &pack, mm_12x16_beside },
+    { "f32 6x64 avx512", DAR_TILE_F32, 1, 4, 6, 64, mm_6x64, &pack, mm_6x64_beside, mm_6x64_taps },
+    { "f32 8x48 avx512", DAR_TILE_F32, 1, 4, 8, 48, mm_8x48, &pack, mm_8x48_beside, mm_8x48_taps },
+    { "f32 12x32 avx512", DAR_TILE_F32, 1, 4, 12, 32, mm_12x32, &pack, mm_12x32_beside, mm_12x32_taps },
+    { "f32 12x16 avx512", DAR_TILE_F32, 1, 4, 12, 16, mm_12x16, &pack, mm_12x16_beside, mm_12x16_taps },
 };
 const dar_tile_set dar_tiles_f32_avx512 = { of, 4 };

@@ -10,29 +10,41 @@
 /* ---------------------------------------------------------------- reference tiles */
 
 #define DEF_MM(NAME, A, B, C, UNIT)                                                                                    \
-    static void NAME(size_t k, const void *a_, size_t a_row, size_t a_k, const void *b_, size_t b_k, void *c_,         \
-                     size_t ldc, size_t m, size_t n, dar_put put)                                                      \
+    static inline void NAME##_any(size_t k, size_t taps, const size_t *at, const A *a, size_t a_row, size_t a_k,       \
+                                  const B *b, size_t b_k, C *c, size_t ldc, size_t m, size_t n, dar_put put)           \
     {                                                                                                                  \
-        const A *a = a_;                                                                                               \
-        const B *b = b_;                                                                                               \
-        C *c = c_;                                                                                                     \
         for (size_t i = 0; i < m; i++)                                                                                 \
             for (size_t j = 0; j < n; j++) {                                                                           \
-                C s = 0;                                                                                               \
+                C sum = 0;                                                                                             \
                 for (size_t p = 0; p < k; p++)                                                                         \
-                    for (size_t u = 0; u < UNIT; u++)                                                                  \
-                        s += (C)a[(i * a_row + p * a_k) * UNIT + u] * (C)b[(p * b_k + j) * UNIT + u];                  \
-                c[i * ldc + j] = put == DAR_PUT_ADD ? c[i * ldc + j] + s : s;                                          \
+                    for (size_t s = 0; s < taps; s++)                                                                  \
+                        for (size_t u = 0; u < UNIT; u++)                                                              \
+                            sum += (C)a[(i * a_row + (p * taps + s) * a_k) * UNIT + u] *                               \
+                                   (C)b[(p * b_k + at[s] + j) * UNIT + u];                                             \
+                c[i * ldc + j] = put == DAR_PUT_ADD ? c[i * ldc + j] + sum : sum;                                      \
             }                                                                                                          \
+    }                                                                                                                  \
+    static void NAME(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c,            \
+                     size_t ldc, size_t m, size_t n, dar_put put)                                                      \
+    {                                                                                                                  \
+        NAME##_any(k, 1, (const size_t[]){ 0 }, a, a_row, a_k, b, b_k, c, ldc, m, n, put);                             \
+    }
+#define DEF_MM_TAPS(NAME)                                                                                              \
+    static void NAME##_taps(size_t k, size_t taps, const size_t *at, const void *a, size_t a_row, const void *b,       \
+                            size_t b_k, void *c, size_t ldc, size_t m, size_t n, dar_put put)                          \
+    {                                                                                                                  \
+        NAME##_any(k, taps, at, a, a_row, 1, b, b_k, c, ldc, m, n, put);                                               \
     }
 DEF_MM(mm_f64, double, double, double, 1)
 DEF_MM(mm_f32, float, float, float, 1)
 DEF_MM(mm_i8, uint8_t, int8_t, int32_t, 4)
+DEF_MM_TAPS(mm_f64)
+DEF_MM_TAPS(mm_f32)
 
 static const dar_tile ref[] = {
-    { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64, NULL, NULL },
-    { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32, NULL, NULL },
-    { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8, NULL, NULL },
+    { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64, NULL, NULL, mm_f64_taps },
+    { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32, NULL, NULL, mm_f32_taps },
+    { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8, NULL, NULL, NULL },
 };
 
 /* ---------------------------------------------------------------- the table */

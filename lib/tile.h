@@ -38,6 +38,9 @@ typedef struct dar_packers {
 typedef void dar_mm_fn(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c,
                        size_t ldc, size_t m, size_t n, dar_put put);
 
+typedef void dar_mm_taps_fn(size_t k, size_t taps, const size_t *at, const void *a, size_t a_row, const void *b,
+                            size_t b_k, void *c, size_t ldc, size_t m, size_t n, dar_put put);
+
 typedef struct dar_tile {
     const char *name; /* "f32 6x64 avx512" */
     dar_tile_kind kind;
@@ -59,6 +62,11 @@ typedef struct dar_tile {
     /* The same where B's next stripe lies beside this one, at b + nr: asks for it meanwhile, since pieces a row apart
      * are nothing that the hardware foresees.  NULL: there is none. */
     dar_mm_fn *mm_beside;
+
+    /* Convolution: each of k units of B's channels is read at several places, and the sum runs over k taps units: unit
+     * (i, k taps + s) of A at a + i * a_row + k * taps + s, with B's unit (k, j) at b + k * b_k + at[s] + j; the rest
+     * as mm.  NULL for DAR_TILE_I8. */
+    dar_mm_taps_fn *mm_taps;
 } dar_tile;
 
 /* The kind that multiplies operands stored as t fastest here: f64 -> F64; bf16 -> BF16 where the processor has it, else

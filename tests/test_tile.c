@@ -119,30 +119,37 @@ static void fill_operands(const dar_tile *t)
     }
 }
 
-/* One product; packed A, or A read where it lies (rows of units + 1).  Rows of C are aligned if it is streamed. */
-static void check_mm(const dar_tile *t, size_t m, size_t n, size_t k, bool in_place, dar_put put)
+enum way { PACKED, IN_PLACE, TAPS, WAYS };
+
+/* One product; packed A, or A read where it lies (rows of units + 1), or B read at three places.  Rows of C are aligned
+ * if it is streamed. */
+static void check_mm(const dar_tile *t, size_t m, size_t n, size_t k, enum way way, dar_put put)
 {
-    static const char *const how[] = { "", " add", " stream" };
-    size_t units = dar_tile_units(t, k), a_row = in_place ? units + 1 : 1, a_k = in_place ? 1 : t->mr;
+    static const char *const how[] = { "", " add", " stream" }, *const ways[] = { "", " in place", " taps" };
+    static const size_t places[] = { 5, 0, 3 }, here[] = { 0 };
+    size_t taps = way == TAPS ? DAR_COUNT(places) : 1, b_k = way == TAPS ? t->nr + 7 : t->nr;
+    size_t units = dar_tile_units(t, k), a_row = way == PACKED ? 1 : units * taps + 1, a_k = way == PACKED ? t->mr : 1;
     size_t ldc = put == DAR_PUT_STREAM ? n / 16 * 16 + 16 : n + 3;
+    const size_t *at = way == TAPS ? places : here;
     double eps = t->kind == DAR_TILE_F64 ? DBL_EPSILON : t->kind == DAR_TILE_I8 ? 0 : FLT_EPSILON;
 
     memcpy(c, before, sizeof c);
-    t->mm(units, a, a_row, a_k, b, t->nr, c, ldc, m, n, put);
+    if (way == TAPS) t->mm_taps(units, taps, at, a, a_row, b, b_k, c, ldc, m, n, put);
+    else t->mm(units, a, a_row, a_k, b, b_k, c, ldc, m, n, put);
     for (size_t i = 0; i < (m + 1) * ldc; i++) {
         size_t row = i / ldc, col = i % ldc;
         bool inside = row < m && col < n;
         double want = inside && put != DAR_PUT_ADD ? 0 : c_at(t, before, i), size = fabs(want);
-        for (size_t p = 0; inside && p < units * t->unit; p++) {
-            size_t at = (row * a_row + p / t->unit * a_k) * t->unit + p % t->unit;
-            double x = t->kind == DAR_TILE_I8 ? ((uint8_t *)a)[at] : stored(of_kind[t->kind], a, at);
-            double y = packed(t, b, t->nr, col, p);
+        for (size_t p = 0; inside && p < units * taps * t->unit; p++) {
+            size_t u = p / t->unit, from = (row * a_row + u * a_k) * t->unit + p % t->unit;
+            double x = t->kind == DAR_TILE_I8 ? ((uint8_t *)a)[from] : stored(of_kind[t->kind], a, from);
+            double y = packed(t, b, b_k, at[u % taps] + col, u / taps * t->unit + p % t->unit);
             want += x * y;
             size += fabs(x * y);
         }
-        double found = c_at(t, c, i), bound = inside ? eps * (double)(k + 8) * size : 0;
+        double found = c_at(t, c, i), bound = inside ? eps * (double)(k * taps + 8) * size : 0;
         CHECK(fabs(found - want) <= bound, "%s m %zu n %zu k %zu%s%s: C[%zu, %zu] = %g, expected %g", t->name, m, n, k,
-              in_place ? " in place" : "", how[put], row, col, found, want);
+              ways[way], how[put], row, col, found, want);
     }
 }
 
@@ -154,7 +161,9 @@ static void check_products(const dar_tile *t)
     for (size_t i = 0; i < DAR_COUNT(rows); i++)
         for (size_t j = 0; j < DAR_COUNT(cols); j++)
             for (size_t k = 0; k < DAR_COUNT(depths); k++)
-                for (int v = 0; v < 6; v++) check_mm(t, rows[i], cols[j], depths[k], v & 1, (dar_put)(v / 2));
+                for (int v = 0; v < 3 * WAYS; v++)
+                    if (v % WAYS != TAPS || t->mm_taps)
+                        check_mm(t, rows[i], cols[j], depths[k], v % WAYS, (dar_put)(v / WAYS));
 }
 
 /* Each distinct tile that dar_tile_fit gives for some shape, at every level. */

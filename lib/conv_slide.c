@@ -1,0 +1,284 @@
+/* conv_slide.c: how the sliding convolution is cut.
+ *
+ *   a frame in runs     of pixels, row by row, with the zeros between the rows: what they make is not stored
+ *   channels in blocks  of x: packed for a run in all frames of the kernel, they fit half of the second-level cache
+ *   tiles               pixels first: rows of w stay in the first-level cache, pixels stream past them
+ *
+ * How channels are cut does not depend on the number of frames. */
+#include "lib/conv_slide.h"
+
+#include "lib/kern.h"
+#include "lib/size.h"
+#include "lib/thread.h"
+#include "lib/tile.h"
+
+#define PIXELS  256                 /* of a run, at most; */
+#define C_BYTES ((size_t)512 << 10) /* more where few channels leave room for them, */
+#define AROUND  2                   /* up to so many times what is read around them */
+#define B_BYTES ((size_t)448 << 10)
+#define STEPS   1024 /* of one tile call */
+#define ROWS    512  /* of w per task */
+#define TASKS   16   /* wanted at least, */
+#define LITTLE  96   /* but none with fewer rows: they pay for packing pixels */
+#define FILL    16   /* channels filled in before they are packed: first-level cache */
+#define TURN    48   /* rows of turned w written together */
+
+struct job {
+    const dar_conv_slide *s;
+    const dar_conv *c;
+    const dar_tile *tile;
+    dar_dtype operand, sum;              /* types of packed operands and of the result */
+    size_t taps, units;                  /* kt kh kw; units of channels */
+    size_t pitch, plane;                 /* pixels from row to row; of an output frame */
+    size_t m, n, down, runs;             /* rows and pixels of a task, tasks along rows and along pixels */
+    size_t ld, depth;                    /* distance of channels in packed pixels, units of a block */
+    bool packs_a;                        /* w is copied; else it is read where it lies */
+    size_t row;                          /* distance of its rows [units] */
+    size_t at_bytes, a_bytes;            /* shared by all threads */
+    size_t b_bytes, c_bytes, fill_bytes; /* of one thread */
+    size_t *at;                          /* where the taps of w's unit read [units] */
+    char *a, *own;
+};
+
+/* Zeros after a row are those before the next one, and enough for the last output columns. */
+static size_t pitch_of(const dar_conv *c)
+{
+    size_t left = c->left > 0 ? (size_t)c->left : 0;
+    int64_t end = (int64_t)(c->Wo + c->kw) - 1 - c->left;
+    return dar_most(dar_most(c->W + left, c->Wo), end > 0 ? (size_t)end : 0);
+}
+
+/* Pixels in a packed run of n: whole lines, and an odd number of them, since channels would share their place in the
+ * cache. */
+static size_t packed_run(const struct job *j, size_t n)
+{
+    size_t line = DAR_ALIGN / j->tile->unit_bytes, around = (j->c->kh - 1) * j->pitch + j->c->kw - 1;
+    return (dar_blocks(n + around, line) | 1) * line;
+}
+
+static void cut(struct job *j)
+{
+    const dar_conv *c = j->c;
+    const dar_tile *t = j->tile;
+    size_t around = AROUND * (c->kh - 1) * j->pitch, elem = dar_dtype_size(j->sum);
+    size_t limit = C_BYTES / elem / dar_most(dar_least(c->Cout, ROWS), 1), frames = c->B * c->To;
+
+    limit = dar_most(dar_least(limit, around), PIXELS);
+    j->n = dar_even_block(j->plane, limit, t->nr, dar_blocks(TASKS, dar_most(frames, 1)), PIXELS);
+    j->runs = dar_blocks(j->plane, j->n);
+    j->m = dar_even_block(c->Cout, ROWS, t->mr, dar_blocks(TASKS, dar_most(frames * j->runs, 1)), LITTLE);
+    j->down = dar_blocks(c->Cout, j->m);
+    j->ld = packed_run(j, j->n);
+
+    size_t fit = B_BYTES / (c->kt * packed_run(j, dar_least(limit, j->plane)) * t->unit_bytes);
+    j->depth = dar_most(dar_least(fit, STEPS / j->taps), 1);
+    j->depth = dar_most(dar_blocks(j->units, dar_most(dar_blocks(j->units, j->depth), 1)), 1);
+}
+
+static struct job job_of(const dar_conv_slide *s)
+{
+    static const dar_dtype of[] = { [DAR_TILE_F64] = DAR_F64, [DAR_TILE_F32] = DAR_F32, [DAR_TILE_BF16] = DAR_BF16 };
+    const dar_conv *c = &s->c;
+    dar_tile_kind kind = dar_tile_kind_for(s->x_type == DAR_BF16 && s->w_type != DAR_BF16 ? DAR_F32 : s->x_type);
+    struct job j = { .s = s, .c = c, .operand = of[kind], .sum = dar_compute_type(s->x_type) };
+
+    j.taps = c->kt * c->kh * c->kw;
+    j.pitch = pitch_of(c);
+    j.plane = c->Ho && c->Wo ? (c->Ho - 1) * j.pitch + c->Wo : 0;
+    j.tile = dar_tile_fit(kind, c->Cout, dar_round_up(j.plane, 32)); /* tiles of 16 columns read w too often */
+    j.units = dar_tile_units(j.tile, c->Cin);
+    cut(&j);
+
+    size_t line = DAR_ALIGN / j.tile->unit_bytes, unit = j.tile->unit_bytes;
+    j.packs_a = s->turned || s->w_type != j.operand || (j.tile->unit > 1 && (j.taps > 1 || c->Cin % j.tile->unit));
+    j.row = j.packs_a ? (dar_blocks(j.units * j.taps, line) | 1) * line : j.units * j.taps;
+    j.at_bytes = dar_round_up(j.taps * sizeof *j.at, DAR_ALIGN);
+    j.a_bytes = j.packs_a ? c->Cout * j.row * unit : 0;
+    j.b_bytes = c->kt * j.depth * j.ld * unit;
+    j.c_bytes = dar_round_up(j.m * j.n * dar_dtype_size(j.sum), DAR_ALIGN);
+    j.fill_bytes = dar_round_up(FILL * j.ld * sizeof(double), DAR_ALIGN);
+    return j;
+}
+
+static size_t own_bytes(const struct job *j)
+{
+    return j->b_bytes + j->c_bytes + j->fill_bytes;
+}
+
+size_t dar_conv_slide_scratch(const dar_conv_slide *s, int threads)
+{
+    struct job j = job_of(s);
+    return j.at_bytes + j.a_bytes + (size_t)threads * own_bytes(&j);
+}
+
+/* ---------------------------------------------------------------- w */
+
+/* The taps of channel c in row r. */
+static const char *taps_of(const struct job *j, size_t r, size_t c)
+{
+    size_t at = j->s->turned ? c * j->c->Cout + r : r * j->c->Cin + c;
+    return (const char *)j->s->w->data + at * j->taps * dar_dtype_size(j->s->w->dtype);
+}
+
+/* Rows [begin, end): for each unit of channels its taps. */
+static void pack_weights(void *ctx, size_t begin, size_t end, int thread)
+{
+    const struct job *j = ctx;
+    size_t unit = j->tile->unit, bytes = j->tile->unit_bytes;
+    (void)thread;
+
+    for (size_t u = 0; u < j->units; u++)
+        for (size_t r = begin; r < end; r++) {
+            char *to = j->a + (r * j->row + u * j->taps) * bytes;
+            const char *low = taps_of(j, r, u * unit);
+            if (unit == 1) {
+                dar_row_convert(j->operand, to, j->s->w->dtype, low, j->taps);
+                continue;
+            }
+            const uint16_t *p = (const void *)low, *q = NULL;
+            uint16_t *pair = (void *)to;
+            if (u * unit + 1 < j->c->Cin) q = (const void *)taps_of(j, r, u * unit + 1);
+            for (size_t i = 0; i < j->taps; i++) {
+                pair[2 * i] = p[i];
+                pair[2 * i + 1] = q ? q[i] : 0;
+            }
+        }
+}
+
+/* ---------------------------------------------------------------- pixels */
+
+/* n elements from place `at` of a frame whose rows are `pitch` apart: zero between and outside them. */
+static void fill(const struct job *j, dar_dtype to, char *dst, dar_dtype type, const char *frame, int64_t at, size_t n)
+{
+    const dar_conv *c = &j->s->c;
+    size_t W = c->W, H = c->H, pitch = j->pitch, size = dar_dtype_size(to), from = dar_dtype_size(type);
+    size_t before = at < 0 ? dar_least((size_t)-at, n) : 0;
+
+    if (W == pitch) W *= H, pitch = W, H = 1;
+    dar_clip_zero(dst, before, size);
+    dst += before * size;
+    n -= before;
+    size_t p = at < 0 ? 0 : (size_t)at, h = p / pitch, w = p % pitch;
+    for (; n && h < H; h++, w = 0) {
+        size_t copy = w < W ? dar_least(W - w, n) : 0, gap = dar_least(pitch - w - copy, n - copy);
+        if (copy) dar_row_convert(to, dst, type, frame + (h * W + w) * from, copy);
+        dar_clip_zero(dst + copy * size, gap, size);
+        dst += (copy + gap) * size;
+        n -= copy + gap;
+    }
+    dar_clip_zero(dst, n, size);
+}
+
+/* Channels from unit u on, in frame t: `units` rows of ld pixels from place `at`. */
+static void pack_frame(const struct job *j, size_t batch, int64_t t, size_t u, size_t units, int64_t at, char *b,
+                       char *buf)
+{
+    const dar_tile *tile = j->tile;
+    size_t c0 = u * tile->unit, channels = dar_least(units * tile->unit, j->c->Cin - c0);
+    dar_dtype type = j->operand;
+
+    if (!dar_clip_frame(&j->s->in, batch, c0, t, &type)) {
+        memset(b, 0, units * j->ld * tile->unit_bytes);
+        return;
+    }
+    bool as_is = tile->unit == 1 && type == j->operand; /* a row of pixels is a row of units */
+    for (size_t i = 0; i < channels; i += FILL) {
+        size_t k = dar_least(FILL, channels - i), size = dar_dtype_size(type);
+        char *rows = as_is ? b + i * j->ld * size : buf;
+        for (size_t c = 0; c < k; c++)
+            fill(j, type, rows + c * j->ld * size, type, dar_clip_frame(&j->s->in, batch, c0 + i + c, t, &type), at,
+                 j->ld);
+        if (!as_is)
+            dar_tile_pack_b_wide(tile, type, buf, j->ld, k, j->ld, j->ld,
+                                 b + i / tile->unit * j->ld * tile->unit_bytes);
+    }
+}
+
+/* ---------------------------------------------------------------- tasks */
+
+/* Rows r0.. of w, pixels q0.. of an output frame. */
+struct task {
+    size_t batch, t, r0, m, q0, n;
+    char *b, *c, *buf;
+};
+
+static void multiply(const struct job *j, const struct task *w, size_t u, size_t units)
+{
+    const dar_tile *t = j->tile;
+    size_t size = dar_dtype_size(j->sum), bytes = t->unit_bytes;
+    const char *a = (j->packs_a ? j->a : (char *)j->s->w->data) + (w->r0 * j->row + u * j->taps) * bytes;
+
+    for (size_t i = 0; i < w->m; i += t->mr)
+        for (size_t q = 0; q < w->n; q += t->nr)
+            t->mm_taps(units, j->taps, j->at, a + i * j->row * bytes, j->row, w->b + q * bytes, j->ld,
+                       w->c + (i * j->n + q) * size, j->n, dar_least(t->mr, w->m - i), dar_least(t->nr, w->n - q),
+                       u ? DAR_PUT_ADD : DAR_PUT);
+}
+
+/* out = c + b, without what lies between the rows. */
+static void store(const struct job *j, const struct task *w)
+{
+    const dar_conv_slide *s = j->s;
+    const dar_clip *v = &s->out;
+    const dar_kern *k = dar_kern_for(j->sum);
+    size_t size = dar_dtype_size(j->sum), Wo = j->c->Wo;
+    bool past = w->t < v->P, bias = s->b && s->b->data;
+    dar_put mode = dar_put_for(v->x->data ? dar_tensor_bytes(v->x) : 0, s->add);
+    dar_dtype type;
+
+    if (past) mode = s->add_past ? DAR_PUT_ADD : DAR_PUT;
+    for (size_t o = w->r0; o < w->r0 + w->m; o++) {
+        char *row = w->c + (o - w->r0) * j->n * size;
+        char *to = dar_clip_frame(v, w->batch, o, (int64_t)w->t - (int64_t)v->P, &type);
+        if (!to) return;
+        if (bias) k->offset(w->n, dar_dtype_get(s->b->dtype, s->b->data, o), row, row);
+        for (size_t i = 0, step; i < w->n; i += step) {
+            size_t h = (w->q0 + i) / j->pitch, x = (w->q0 + i) % j->pitch, n = x < Wo ? dar_least(Wo - x, w->n - i) : 0;
+            step = j->pitch - x;
+            if (n) dar_row_put(j->sum, row + i * size, type, to + (h * Wo + x) * dar_dtype_size(type), n, mode);
+        }
+    }
+}
+
+static void task(void *ctx, size_t i, int thread)
+{
+    const struct job *j = ctx;
+    const dar_conv *c = j->c;
+    struct task w = { .r0 = i % j->down * j->m, .q0 = i / j->down % j->runs * j->n };
+    size_t frame = i / j->down / j->runs, bytes = j->tile->unit_bytes;
+    int64_t at = (int64_t)w.q0 - c->left - c->top * (int64_t)j->pitch;
+
+    w.t = frame % c->To;
+    w.batch = frame / c->To;
+    w.m = dar_least(j->m, c->Cout - w.r0);
+    w.n = dar_least(j->n, j->plane - w.q0);
+    w.b = j->own + (size_t)thread * own_bytes(j);
+    w.c = w.b + j->b_bytes;
+    w.buf = w.c + j->c_bytes;
+    for (size_t u = 0; u == 0 || u < j->units; u += j->depth) { /* of no channels: zeros */
+        size_t units = dar_least(j->depth, j->units - u);
+        for (size_t kt = 0; kt < c->kt; kt++)
+            pack_frame(j, w.batch, (int64_t)(w.t + kt) - c->front, u, units, at, w.b + kt * j->depth * j->ld * bytes,
+                       w.buf);
+        multiply(j, &w, u, units);
+    }
+    store(j, &w);
+}
+
+void dar_conv_slide_run(const dar_conv_slide *s, void *scratch)
+{
+    struct job j = job_of(s);
+    const dar_conv *c = &s->c;
+    size_t all = c->B * c->To * j.runs * j.down;
+
+    if (!all) return;
+    j.at = scratch;
+    j.a = (char *)scratch + j.at_bytes;
+    j.own = j.a + j.a_bytes;
+    for (size_t i = 0; i < j.taps; i++) {
+        size_t tap = s->turned ? j.taps - 1 - i : i, kt = tap / c->kw / c->kh;
+        j.at[i] = kt * j.depth * j.ld + tap / c->kw % c->kh * j.pitch + tap % c->kw;
+    }
+    if (j.packs_a) dar_parallel_range(c->Cout, TURN, pack_weights, &j);
+    dar_parallel(all, task, &j);
+}
