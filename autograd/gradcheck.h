@@ -39,6 +39,7 @@ typedef struct dar_gradcheck {
     const dar_tensor *x; /* n inputs, f64, contiguous; data NULL: absent, fn gets NULL */
     const bool *frozen;  /* inputs without gradient; NULL: none */
     double gap;          /* distance to the next kink, in every input; 0: none */
+    bool directions;     /* small inputs too are checked along random directions only */
     uint64_t seed;
 } dar_gradcheck;
 

@@ -8,7 +8,7 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define GROUP ((int64_t)1 << 26) /* elements of the patches of one group of pictures */
+#define GROUP ((int64_t)1 << 26) /* 256 MB */
 
 /* ---------------------------------------------------------------- parameters */
 
@@ -37,7 +37,7 @@ void dar_adapter_init(dar_adapter *a, dar_params *p, const dar_adapter_config *c
     int64_t channels = (c->rays + c->geometry) * c->unshuffle * c->unshuffle;
     double spread = 1 / sqrt(4 * (double)channels);
 
-    *a = (dar_adapter){ .c = *c, .width = width, .storage = p->storage, .main = p->main };
+    *a = (dar_adapter){ .c = *c, .width = width, .storage = p->storage, .main = p->main, .group = GROUP };
     if (!channels) return;
     DAR_ASSERT(c->blocks <= DAR_ADAPTER_BLOCKS, "adapter: %lld blocks", (long long)c->blocks);
     a->w = declare(p, true, DAR_FRESH_UNIFORM, spread, DAR_SHAPE(width, channels, 2, 2), "conv.weight");
@@ -223,7 +223,7 @@ dar_val *dar_adapter_forward(dar_tape *t, const dar_adapter *a, const dar_tensor
                "adapter: %lld channels of %lld x %lld pixels, expected %lld and multiples of %lld", (long long)s->d[1],
                (long long)s->d[3], (long long)s->d[4], (long long)channels, (long long)side);
     struct group all = { a, *cond, 0, s->d[0] * s->d[2], s->d[3] / side, s->d[4] / side };
-    int64_t most = GROUP / (all.h * all.w * side * side * channels);
+    int64_t most = a->group / (all.h * all.w * side * side * channels);
     dar_val *y = (t->recording ? recorded : computed)(t, &all, most < 1 ? 1 : most);
     return dar_reshape(t, y, DAR_SHAPE(s->d[0], s->d[2] * all.h * all.w, a->width));
 }

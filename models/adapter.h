@@ -25,6 +25,7 @@ typedef struct dar_adapter {
     dar_adapter_config c;
     int64_t width;
     dar_dtype storage, main;
+    int64_t group;    /* patches of as many pictures as this many numbers hold are made at a time, at least one's */
     dar_param *w, *b; /* NULL: there is no adapter */
     dar_param *block[DAR_ADAPTER_BLOCKS][4];
 } dar_adapter;

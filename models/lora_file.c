@@ -1,6 +1,7 @@
 /* lora_file.c: names of low-rank additions in files; reading and writing them. */
 #include "models/lora.h"
 
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -127,6 +128,7 @@ static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const s
         DAR_TRY(dar_weights_tensor(f, name[DAR_LORA_ALPHA], &alpha, e));
         if (dar_tensor_count(&alpha) != 1) return wrong_shape(name[DAR_LORA_ALPHA], &alpha, (dar_shape){ 0 }, e);
         a = dar_dtype_get(alpha.dtype, alpha.data, 0);
+        if (!isfinite(a)) return dar_fail(e, DAR_ERR_FORMAT, "%s: found %g", name[DAR_LORA_ALPHA], a);
     }
     if (!q->down) dar_lora_declare(m, p, block, which, rank);
     q->scale = o->strength * a / (double)rank;

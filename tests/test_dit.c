@@ -2,6 +2,8 @@
  * values and gradients; what must hold whatever the numbers are. */
 #include "tests/test.h"
 
+#include "autograd/gradcheck.h"
+#include "lib/rng.h"
 #include "tests/model.h"
 
 /* Largest deviation over the largest value. */
@@ -182,10 +184,76 @@ static void matches_the_reference(void **state)
         }
 }
 
+/* ---------------------------------------------------------------- the whole network's gradient */
+
+struct probe {
+    model *o;
+    dar_param *q[200];
+    int n;
+};
+
+static dar_val *probe_loss(dar_tape *t, void *arg, dar_val *const *in)
+{
+    struct probe *p = arg;
+    model *o = p->o;
+    dar_dit_scene *s = dar_tape_room(t, sizeof *s);
+    dar_dit_text *x = dar_tape_room(t, sizeof *x);
+
+    for (int i = 0; i < p->n; i++) p->q[i]->x = in[i]->x, p->q[i]->g = in[i]->g;
+    dar_dit_scene_prepare(t, &o->m, &o->clip, s);
+    dar_dit_text_prepare(t, &o->m, &o->text, o->count, x);
+    dar_val *v = dar_dit_forward(t, &o->m, s, x, dar_leaf(t, o->z, NULL), &(dar_dit_time){ model_times, 2 });
+    return dar_squared_error(t, v, dar_leaf(t, o->target, NULL), NULL, true);
+}
+
+/* Every trainable tensor along random directions, through the segments. */
+static void check_gradient(unsigned roles, const char *what)
+{
+    dar_config c = model_preset("dar-test");
+    model o;
+    struct probe p = { .o = &o };
+    dar_tensor x[200];
+
+    model_init(&o, &c, DAR_F64, false);
+    if (roles & DAR_PARAM_LORA) dar_lora_init(&o.m, &o.p, &c.lora);
+    dar_params_train(&o.p, roles);
+    dar_params_fresh(&o.p, DAR_PARAM_ALL, 5);
+    model_clip(&o, 2, 1, 2, 4);
+    for (size_t i = 0; i < o.p.count; i++) {
+        dar_param *q = o.p.at[i];
+        /* What starts at zero would hide the rest. */
+        if (q->info.law == DAR_FRESH_VALUE && q->info.spread == 0) dar_rng_fill_uniform(&q->x, 9, i, -0.4, 0.4);
+        if (!q->trainable) continue;
+        CHECK(p.n < 200, "too many parameters");
+        p.q[p.n] = q;
+        x[p.n++] = q->x;
+    }
+    /* Steps of 1e-4 at most: the adapter's ReLUs have kinks, a few hundred of them. */
+    dar_gradcheck_result r = dar_gradcheck_run(
+        &(dar_gradcheck){ .fn = probe_loss, .arg = &p, .n = p.n, .x = x, .gap = 1e-4, .directions = true, .seed = 3 },
+        &o.step);
+    printf("note: gradient of dar-test, %s, %d tensors: %.1e in %s, dot test %.1e\n", what, p.n, r.diff,
+           p.q[r.input]->name, r.dot);
+    CHECK(r.diff < 1e-7, "%s: %s: backward %.17g, differences %.17g", what, p.q[r.input]->name, r.found, r.expected);
+    CHECK(r.dot < 1e-7, "%s: dot test %.3g", what, r.dot);
+    model_free(&o);
+}
+
+static void gradient_is_right(void **state)
+{
+    int before = dar_threads();
+    (void)state;
+    dar_threads_set(1); /* waking threads would cost more than the work */
+    check_gradient(DAR_PARAM_LORA | DAR_PARAM_ADAPTER, "LoRA and adapter");
+    check_gradient(DAR_PARAM_BASE | DAR_PARAM_ADAPTER, "all weights");
+    dar_threads_set(before);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(matches_the_reference),
+        cmocka_unit_test(gradient_is_right),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
