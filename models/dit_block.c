@@ -1,7 +1,7 @@
 /* dit_block.c: one block of the transformer, and the stack of them. */
 #include "models/dit.h"
 
-enum { SHIFT_SELF, SCALE_SELF, GATE_SELF, SHIFT_FFN, SCALE_FFN, GATE_FFN, MODULATIONS };
+enum { SHIFT, SCALE, GATE };
 
 dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *p, dar_act act, dar_val *x)
 {
@@ -11,84 +11,129 @@ dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *
     return dar_lora(t, x, w, b, dar_param_leaf(t, p->down), dar_param_leaf(t, p->up), p->scale, &o);
 }
 
-/* modulation + e0, taken apart: [B, R, D] each */
-static void modulations(dar_tape *t, const dar_dit *m, const dar_dit_block *b, dar_val *e0, dar_val **out)
-{
-    int64_t B = e0->x.shape.d[0], R = e0->x.shape.d[1], D = m->c.width;
-    dar_val *e = dar_reshape(t, e0, DAR_SHAPE(B, R, MODULATIONS, D));
-    e = dar_add(t, e, dar_param_leaf(t, b->modulation));
-    for (int i = 0; i < MODULATIONS; i++) out[i] = dar_reshape(t, dar_slice(t, e, 2, i, 1), DAR_SHAPE(B, R, D));
-}
-
 struct block {
     const dar_dit *m;
     const dar_dit_block *b;
     const dar_dit_scene *s;
-    dar_val *log_weight;
+    dar_val *log_weight; /* a leaf */
+    dar_val *e0, *k, *v; /* inputs of a segment: in a replay, what stands for them */
 };
 
-/* in: x [B, L, D], e0 [B, R, 6 D], keys and values of the text [B, n + 1, D] -> [B, L, D] */
+/* Three rows of modulation + e0, from `first`: [B, R, D] each */
+static void modulations(dar_tape *t, const struct block *a, int first, dar_val *out[3])
+{
+    int64_t B = a->e0->x.shape.d[0], R = a->e0->x.shape.d[1], D = a->m->c.width;
+    dar_val *e = dar_slice(t, dar_reshape(t, a->e0, DAR_SHAPE(B, R, 6, D)), 2, first, 3);
+    e = dar_add(t, e, dar_slice(t, dar_param_leaf(t, a->b->modulation), 1, first, 3));
+    for (int i = 0; i < 3; i++) out[i] = dar_reshape(t, dar_slice(t, e, 2, i, 1), DAR_SHAPE(B, R, D));
+}
+
+static dar_val *product(dar_tape *t, const struct block *a, dar_projection which, dar_val *x)
+{
+    return dar_dit_multiply(t, a->m, &a->b->product[which], which == DAR_FFN_UP ? DAR_ACT_GELU_TANH : DAR_ACT_NONE, x);
+}
+
+static dar_val *rms(dar_tape *t, const struct block *a, const dar_param *w, dar_val *x)
+{
+    return dar_rms_norm(t, x, dar_param_leaf(t, w), &(dar_norm_opt){ .eps = a->m->c.eps });
+}
+
+/* The norms before products: from the stream to the products' type. */
+static dar_norm_opt norm_before(const struct block *a)
+{
+    return (dar_norm_opt){ .eps = a->m->c.eps, .cast = true, .out = a->m->storage, .split = a->s->frame };
+}
+
+/* x [B, L, D] -> [B, L, D], all three */
+static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
+{
+    dar_attention_opt o = { .heads = a->m->c.heads, .keep = a->m->keep };
+    dar_norm_opt norm = norm_before(a);
+    dar_val *mod[3];
+
+    modulations(t, a, 0, mod);
+    dar_val *h = dar_modulate(t, x, mod[SCALE], mod[SHIFT], &norm);
+    dar_val *q = rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h));
+    dar_val *k = rms(t, a, a->b->norm_k[0], product(t, a, DAR_SELF_K, h));
+    dar_val *v = product(t, a, DAR_SELF_V, h);
+    h = dar_attention(t, dar_rope(t, q, a->s->rope), dar_rope(t, k, a->s->rope), v, &o);
+    return dar_gate(t, x, product(t, a, DAR_SELF_O, h), mod[GATE], a->s->frame);
+}
+
+static dar_val *cross_attention(dar_tape *t, const struct block *a, dar_val *x)
+{
+    dar_attention_opt o = { .heads = a->m->c.heads, .keep = a->m->keep, .log_weight = a->log_weight };
+    dar_norm_opt norm = norm_before(a);
+    dar_val *h = dar_layer_norm(t, x, dar_param_leaf(t, a->b->norm3_w), dar_param_leaf(t, a->b->norm3_b), &norm);
+    dar_val *q = rms(t, a, a->b->norm_q[1], product(t, a, DAR_CROSS_Q, h));
+    h = dar_attention(t, q, a->k, a->v, &o);
+    return dar_add(t, x, product(t, a, DAR_CROSS_O, h));
+}
+
+static dar_val *feed_forward(dar_tape *t, const struct block *a, dar_val *x)
+{
+    dar_norm_opt norm = norm_before(a);
+    dar_val *mod[3];
+
+    modulations(t, a, 3, mod);
+    dar_val *h = dar_modulate(t, x, mod[SCALE], mod[SHIFT], &norm);
+    h = product(t, a, DAR_FFN_DOWN, product(t, a, DAR_FFN_UP, h));
+    return dar_gate(t, x, h, mod[GATE], a->s->frame);
+}
+
+typedef dar_val *part_fn(dar_tape *t, const struct block *a, dar_val *x);
+static part_fn *const parts[] = { self_attention, cross_attention, feed_forward };
+
+/* in: x, e0, k, v */
 static dar_val *block(dar_tape *t, void *arg, dar_val *const *in)
 {
-    const struct block *a = arg;
-    const dar_dit *m = a->m;
-    const dar_dit_block *b = a->b;
-    const dar_dit_product *p = b->product;
-    int64_t frame = a->s->frame;
-    dar_norm_opt norm = { .eps = m->c.eps, .cast = true, .out = m->storage, .split = frame }, rms = { .eps = m->c.eps };
-    dar_attention_opt self = { .heads = m->c.heads, .keep = m->keep }, cross = self;
-    dar_val *x = in[0], *mod[MODULATIONS];
+    struct block a = *(const struct block *)arg;
+    dar_val *x = in[0];
+    a.e0 = in[1], a.k = in[2], a.v = in[3];
+    for (size_t i = 0; i < DAR_COUNT(parts); i++) x = parts[i](t, &a, x);
+    return x;
+}
 
-    modulations(t, m, b, in[1], mod);
-    dar_val *h = dar_modulate(t, x, mod[SCALE_SELF], mod[SHIFT_SELF], &norm);
-    dar_val *q = dar_dit_multiply(t, m, &p[DAR_SELF_Q], DAR_ACT_NONE, h);
-    dar_val *k = dar_dit_multiply(t, m, &p[DAR_SELF_K], DAR_ACT_NONE, h);
-    dar_val *v = dar_dit_multiply(t, m, &p[DAR_SELF_V], DAR_ACT_NONE, h);
-    q = dar_rope(t, dar_rms_norm(t, q, dar_param_leaf(t, b->norm_q[0]), &rms), a->s->rope);
-    k = dar_rope(t, dar_rms_norm(t, k, dar_param_leaf(t, b->norm_k[0]), &rms), a->s->rope);
-    h = dar_attention(t, q, k, v, &self);
-    x = dar_gate(t, x, dar_dit_multiply(t, m, &p[DAR_SELF_O], DAR_ACT_NONE, h), mod[GATE_SELF], frame);
+/* ---------------------------------------------------------------- the stack */
 
-    cross.log_weight = a->log_weight;
-    h = dar_layer_norm(t, x, dar_param_leaf(t, b->norm3_w), dar_param_leaf(t, b->norm3_b), &norm);
-    q = dar_dit_multiply(t, m, &p[DAR_CROSS_Q], DAR_ACT_NONE, h);
-    q = dar_rms_norm(t, q, dar_param_leaf(t, b->norm_q[1]), &rms);
-    h = dar_attention(t, q, in[2], in[3], &cross);
-    x = dar_add(t, x, dar_dit_multiply(t, m, &p[DAR_CROSS_O], DAR_ACT_NONE, h));
-
-    h = dar_modulate(t, x, mod[SCALE_FFN], mod[SHIFT_FFN], &norm);
-    h = dar_dit_multiply(t, m, &p[DAR_FFN_UP], DAR_ACT_GELU_TANH, h);
-    h = dar_dit_multiply(t, m, &p[DAR_FFN_DOWN], DAR_ACT_NONE, h);
-    return dar_gate(t, x, h, mod[GATE_FFN], frame);
+static struct block block_of(const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x, dar_val *e0)
+{
+    return (struct block){ m, &m->block[i], s, x->log_weight, e0, x->k[i], x->v[i] };
 }
 
 dar_val *dar_dit_block_forward(dar_tape *t, const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x,
                                dar_val *e0, dar_val *tokens)
 {
-    struct block a = { m, &m->block[i], s, x->log_weight };
+    struct block a = block_of(m, i, s, x, e0);
     return block(t, &a, (dar_val *[]){ tokens, e0, x->k[i], x->v[i] });
 }
 
-static dar_val *segment(dar_tape *t, const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x,
-                        dar_val *e0, dar_val *tokens)
+static dar_val *segment(dar_tape *t, const struct block *b, dar_val *tokens)
 {
-    struct block *a = dar_tape_store(t, &(struct block){ m, &m->block[i], s, x->log_weight }, sizeof *a);
-    dar_val *in[] = { tokens, e0, x->k[i], x->v[i] };
+    struct block *a = dar_tape_store(t, b, sizeof *b);
+    dar_val *in[] = { tokens, a->e0, a->k, a->v };
     return dar_segment(t, block, a, in, DAR_COUNT(in), tokens->x.dtype, tokens->x.shape);
+}
+
+/* Nothing looks back: one stream, written over after every part. */
+static void in_place(dar_tape *t, const struct block *a, dar_val *tokens)
+{
+    for (size_t i = 0; i < DAR_COUNT(parts); i++) {
+        dar_mark m = dar_arena_mark(t->arena);
+        dar_val *y = parts[i](t, a, tokens);
+        if (!t->arena->plan) dar_tensor_copy(&tokens->x, &y->x);
+        dar_arena_reset(t->arena, m);
+    }
 }
 
 dar_val *dar_dit_blocks(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,
                         const dar_dit_moment *e, dar_val *tokens)
 {
     for (int i = 0; i < m->c.layers; i++) {
-        if (t->recording) {
-            tokens = (m->whole ? dar_dit_block_forward : segment)(t, m, i, s, x, e->e0, tokens);
-            continue;
-        }
-        dar_mark mark = dar_arena_mark(t->arena); /* nothing looks back: one stream, written over */
-        dar_val *y = dar_dit_block_forward(t, m, i, s, x, e->e0, tokens);
-        if (!t->arena->plan) dar_tensor_copy(&tokens->x, &y->x);
-        dar_arena_reset(t->arena, mark);
+        struct block a = block_of(m, i, s, x, e->e0);
+        if (!t->recording) in_place(t, &a, tokens);
+        else if (m->whole) tokens = dar_dit_block_forward(t, m, i, s, x, e->e0, tokens);
+        else tokens = segment(t, &a, tokens);
     }
     return tokens;
 }

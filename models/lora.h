@@ -3,7 +3,7 @@
  * scale = strength alpha / r.  A fresh A is uniform in +- 1 / sqrt(in), a fresh U is 0: nothing changes at first, not a
  * bit.  Parameters are named as in the files that are written.  One set at a time.
  *
- * Files are safetensors.  Read are three forms, told apart by their keys:
+ * Files (lib/weights.h) have one of three forms, told apart by their keys:
  *
  *   lora_unet__blocks_0_self_attn_q.lora_down.weight, .lora_up.weight, .alpha       kohya, VideoX-Fun; written
  *   blocks.0.self_attn.q.lora_A.weight, .lora_B.weight                              PEFT

@@ -170,16 +170,16 @@ static void keys_are_understood(void **state)
 
 static void read_back(model *o, const dar_config *c, const char *path, const dar_lora_read_options *options)
 {
-    dar_safetensors *f;
+    dar_weights *f;
     dar_err e;
     dar_config plain = *c;
     plain.lora.rank = 0;
     init(o, &plain, DAR_F32);
-    must(dar_safetensors_open(&f, path, &e), &e);
+    must(dar_weights_open(&f, path, &e), &e);
     must(dar_lora_read(&o->m, &o->p, f, options, &e), &e);
     dar_tensor v = velocity(o); /* parameters may view the file: before it goes */
     o->target = v;
-    dar_safetensors_close(f);
+    dar_weights_close(f);
 }
 
 static void written_is_read(void **state)
@@ -269,14 +269,14 @@ static void bad_files_are_told(void **state)
     for (size_t i = 0; i < DAR_COUNT(bad); i++) {
         model o;
         dar_config c = model_preset("dar-test");
-        dar_safetensors *f;
+        dar_weights *f;
         dar_err e;
         must(dar_safetensors_write(PATH, bad[i].item, (size_t)bad[i].n, NULL, &e), &e);
-        must(dar_safetensors_open(&f, PATH, &e), &e);
+        must(dar_weights_open(&f, PATH, &e), &e);
         model_init(&o, &c, DAR_F32, false);
         dar_status s = dar_lora_read(&o.m, &o.p, f, &(dar_lora_read_options){ .strength = 1 }, &e);
         CHECK(s == DAR_ERR_FORMAT && strstr(e.text, bad[i].text), "file %zu: status %d, %s", i, (int)s, e.text);
-        dar_safetensors_close(f);
+        dar_weights_close(f);
         model_free(&o);
     }
     unlink(PATH);
