@@ -88,8 +88,7 @@ dar_status dar_file_flush(dar_file_out *o, dar_err *e)
     return error ? refused(o, error, e) : DAR_OK;
 }
 
-/* A rename is on the disk when its directory is. */
-static int flush_directory(const char *path)
+int dar_file_flush_entry(const char *path)
 {
     char dir[PATH_MAX];
     const char *slash = strrchr(path, '/');
@@ -108,7 +107,7 @@ dar_status dar_file_commit(dar_file_out *o, dar_err *e)
     DAR_TRY(dar_file_flush(o, e));
     if (rename(o->temp, o->path) != 0) return refused(o, errno, e);
     o->temp[0] = 0;
-    int error = flush_directory(o->path);
+    int error = dar_file_flush_entry(o->path);
     return error ? refused(o, error, e) : DAR_OK;
 }
 

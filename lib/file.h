@@ -42,4 +42,7 @@ dar_status dar_file_commit(dar_file_out *o, dar_err *e);
 /* Remove what was not committed.  Accepts a committed or zeroed one. */
 void dar_file_discard(dar_file_out *o);
 
+/* A name that was made or changed is on the disk when its directory is: flush that.  0, or an errno. */
+int dar_file_flush_entry(const char *path);
+
 #endif

@@ -26,6 +26,7 @@ BEGIN {
     only["cJSON.h"] = "^lib/json[.]c$"
     only["zlib.h"] = "^data/(de|in)flate[.]c$"
     only["hdf5.h"] = "^data/h5[.]c$"
+    only["zlib.h"] = "^data/deflate[.]c$"
     only["openexr.h"] = "^data/exr[.]c$"
     only["png.h"] = "^data/png[.]c$"
     only["jpeglib.h"] = "^data/jpeg[.]c$"
@@ -37,7 +38,7 @@ BEGIN {
 
     standard = "^(complex|ctype|errno|fenv|float|inttypes|limits|locale|math|setjmp|signal|stdalign|stdarg|" \
         "stdatomic|stdbool|stddef|stdint|stdio|stdlib|string|time|wchar|" \
-        "dirent|fcntl|pthread|sched|spawn|strings|unistd|sys/[a-z]+)[.]h$"
+        "dirent|fcntl|ftw|pthread|sched|spawn|strings|unistd|sys/[a-z]+)[.]h$"
 }
 
 FNR == 1 {
