@@ -444,6 +444,20 @@ dar_status dar_h5_read(dar_h5 *f, const char *name, const dar_h5_array *a, uint6
     return transfer(f, name, a, first, count, data, NULL, e);
 }
 
+dar_status dar_h5_write_chunk(dar_h5 *f, const char *name, const dar_h5_array *a, uint64_t index, const void *data,
+                              size_t size, dar_err *e)
+{
+    const hsize_t at[DAR_H5_RANK] = { index };
+    check_array(name, a);
+    DAR_ASSERT(a->chunk <= 1 && index < a->dim[0], "%s: chunk %" PRIu64 " of %" PRIu64, name, index, a->dim[0]);
+    silence();
+    hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT);
+    bool done = set >= 0 && H5Dwrite_chunk(set, H5P_DEFAULT, 0, at, size, data) >= 0;
+    dar_status s = done ? DAR_OK : refused(f, name, "cannot write", e);
+    if (set >= 0) H5Dclose(set);
+    return s;
+}
+
 /* ---------------------------------------------------------------- attributes */
 
 static dar_status put(dar_h5 *f, const char *name, const char *key, hid_t type, hid_t space, const void *data,

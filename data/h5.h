@@ -60,6 +60,11 @@ dar_status dar_h5_write(dar_h5 *f, const char *name, const dar_h5_array *a, uint
 dar_status dar_h5_read(dar_h5 *f, const char *name, const dar_h5_array *a, uint64_t first, uint64_t count, void *data,
                        dar_err *e);
 
+/* Chunk number `index` of an array made with one leading index per chunk: data[0, size) is what HDF5's filters would
+ * make of it, its bytes shuffled (first bytes of all elements, then second bytes ...), then deflated. */
+dar_status dar_h5_write_chunk(dar_h5 *f, const char *name, const dar_h5_array *a, uint64_t index, const void *data,
+                              size_t size, dar_err *e);
+
 /* ---------------------------------------------------------------- attributes of a dataset */
 
 dar_status dar_h5_put_numbers(dar_h5 *f, const char *name, const char *key, const double *x, size_t n, dar_err *e);

@@ -26,7 +26,6 @@ BEGIN {
     only["cJSON.h"] = "^lib/json[.]c$"
     only["zlib.h"] = "^data/(de|in)flate[.]c$"
     only["hdf5.h"] = "^data/h5[.]c$"
-    only["zlib.h"] = "^data/deflate[.]c$"
     only["openexr.h"] = "^data/exr[.]c$"
     only["png.h"] = "^data/png[.]c$"
     only["jpeglib.h"] = "^data/jpeg[.]c$"

@@ -4,6 +4,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "data/deflate.h"
 #include "data/h5.h"
 #include "lib/file.h"
 
@@ -139,6 +140,44 @@ static void foreign(void **state)
     dar_h5_close(f);
 }
 
+/* Chunks deflated by us, in pieces of 128 KiB: HDF5's own filters read them, whatever is on a piece's edge. */
+static void own_chunks(void **state)
+{
+    (void)state;
+    enum { MOST = 400001, CHUNKS = 3 };
+    static const size_t sizes[] = { 1, 131071, 131072, 131073, 262144, MOST };
+    static uint8_t x[CHUNKS][MOST], y[MOST], out[CHUNKS][2 * MOST];
+    dar_deflate *d;
+    dar_err e;
+    dar_h5 *f;
+    ok(dar_deflate_new(&d, CHUNKS * MOST, &e), &e);
+    for (size_t i = 0; i < MOST; i++) {
+        x[0][i] = (uint8_t)(((i + 9) * 2654435761u) >> 13 ^ i >> 3); /* does not shrink */
+        x[2][i] = i == MOST - 1 || i % 150000 == 0;                  /* all but zeros */
+    }
+    for (size_t k = 0; k < DAR_COUNT(sizes); k++) {
+        dar_h5_array a = { .type = DAR_H5_U8, .rank = 2, .dim = { CHUNKS, sizes[k] } };
+        dar_deflate_stream s[CHUNKS];
+        CHECK(dar_deflate_bound(sizes[k]) <= sizeof out[0], "bound of %zu", sizes[k]);
+        for (int c = 0; c < CHUNKS; c++) s[c] = (dar_deflate_stream){ .data = x[c], .size = sizes[k], .out = out[c] };
+        dar_deflate_run(d, s, CHUNKS);
+        CHECK(!s[0].zero && s[1].zero && !s[2].zero, "zeros");
+        ok(dar_h5_create(&f, in_dir("a.h5"), &e), &e);
+        ok(dar_h5_make(f, "x", &a, &e), &e);
+        for (uint64_t c = 0; c < CHUNKS; c++) ok(dar_h5_write_chunk(f, "x", &a, c, s[c].out, s[c].out_size, &e), &e);
+        ok(dar_h5_commit(f, &e), &e);
+        dar_h5_close(f);
+        ok(dar_h5_open(&f, in_dir("a.h5"), &e), &e);
+        ok(dar_h5_expect(f, "x", &a, &e), &e);
+        for (uint64_t c = 0; c < CHUNKS; c++) {
+            ok(dar_h5_read(f, "x", &a, c, 1, y, &e), &e);
+            CHECK(memcmp(x[c], y, sizes[k]) == 0, "%zu bytes of chunk %d came back changed", sizes[k], (int)c);
+        }
+        dar_h5_close(f);
+    }
+    dar_deflate_free(d);
+}
+
 static void attributes(void **state)
 {
     (void)state;
@@ -272,9 +311,9 @@ static int tear_down(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = { cmocka_unit_test(round_trip),   cmocka_unit_test(several_rows),
-                                        cmocka_unit_test(foreign),      cmocka_unit_test(attributes),
-                                        cmocka_unit_test(does_not_fit), cmocka_unit_test(never_half),
-                                        cmocka_unit_test(damaged) };
+    const struct CMUnitTest tests[] = { cmocka_unit_test(round_trip), cmocka_unit_test(several_rows),
+                                        cmocka_unit_test(foreign),    cmocka_unit_test(own_chunks),
+                                        cmocka_unit_test(attributes), cmocka_unit_test(does_not_fit),
+                                        cmocka_unit_test(never_half), cmocka_unit_test(damaged) };
     return cmocka_run_group_tests(tests, set_up, tear_down) != 0;
 }
