@@ -26,9 +26,11 @@
  * family.  u16 world positions are off by at most 1 / 131070 of world.size (7.7e-6 of the scene's longest side), and
  * their n = 65535 q with the q of data/world.h; datasets of u8, u16, i16 carry attributes scale and offset.
  *
- * Bundles of other tools: meta.json needs format, width, height, frames, fps and families; a family may be of type u8,
- * u16, i16 or f32, whatever is written here, or lie in exr/; world in integers needs `world`.  Without a mask, what has
- * a depth is covered.
+ * Bundles of other tools: meta.json needs format, width, height, frames, fps and families, which is an object of
+ * "name": { "type", "file", "scale", "offset" }: type u8, u16, i16 or f32, u32 for id and part; file "gbuffer.h5" or
+ * "exr", whose families are f32, the mask u8; scale and offset per channel, of integers, with the above as defaults but
+ * for world and depth.  Without a mask, what has a depth is covered.  A key that is not known is refused; "extra" may
+ * hold anything.
  *
  * A bundle appears whole or not at all: it is written into a directory of another name beside it.  What a writer that
  * died left there is removed by the next writer of the same bundle. */
@@ -168,7 +170,7 @@ typedef struct dar_bundle_frame {
     dar_gbuffer g;         /* those of the families, and the mask */
     const uint8_t *sparse; /* [3, H, W] map of tracks */
     const uint8_t *rgb;    /* [H, W, 3] */
-    bool copied;           /* g and sparse equal the frame before: they are not looked at */
+    bool copied;           /* g and sparse equal the frame before: they are looked at for EXR files alone */
 } dar_bundle_frame;
 
 typedef struct dar_bundle_writer dar_bundle_writer;
