@@ -143,8 +143,10 @@ struct sum {
     size_t count; /* elements of y */
 };
 
-#define BLOCK      32  /* terms added in f32 */
-#define MOST_PARTS 128 /* units x chunks, where there is more than one chunk */
+#define BLOCK       32  /* terms added in f32 */
+#define BESIDE      4   /* pieces of y summed side by side, so that rows of x are read in long runs */
+#define LEAST_TASKS 16  /* that are left when pieces are put side by side */
+#define MOST_PARTS  128 /* units x chunks, where there is more than one chunk */
 
 static struct sum plan_sum(const dar_bcast *b)
 {
@@ -162,7 +164,8 @@ static struct sum plan_sum(const dar_bcast *b)
     if (s.units < MOST_PARTS) s.chunks = min((s.terms + least - 1) / least, MOST_PARTS / s.units);
     s.chunk = (s.terms + s.chunks - 1) / s.chunks;
     s.chunks = (s.terms + s.chunk - 1) / s.chunk;
-    if (s.inner && s.chunks == 1) s.group = min(least / s.terms + 1, DAR_PIECE);
+    if (!s.inner) s.group = min(s.units * s.chunks / LEAST_TASKS + 1, BESIDE);
+    else if (s.chunks == 1) s.group = min(least / s.terms + 1, DAR_PIECE);
     return s;
 }
 
@@ -214,21 +217,25 @@ static void flush(dar_dtype c, size_t n, void *row, double *acc)
     memset(row, 0, n * dar_dtype_size(c));
 }
 
-/* A unit that is a piece of the last dimension: its numbers into acc, and how many. */
-static size_t sum_outer(const struct sum *s, size_t unit, size_t begin, size_t end, double *acc)
+/* Units that are pieces of the last dimension: their numbers into acc. */
+static void sum_outer(const struct sum *s, size_t unit, size_t units, size_t begin, size_t end,
+                      double (*acc)[DAR_PIECE])
 {
     dar_dtype c = dar_compute_type(s->b->x[0]->dtype);
     const dar_kern *k = dar_kern_for(c);
-    double buf[1 + DAR_BCAST_IN][DAR_PIECE], row[DAR_PIECE] = { 0 };
-    size_t n = piece_length(&s->w, unit % s->w.pieces);
+    double buf[1 + DAR_BCAST_IN][DAR_PIECE], row[BESIDE][DAR_PIECE];
+    size_t width = min(s->w.d[s->w.n - 1], DAR_PIECE);
 
-    memset(acc, 0, n * sizeof *acc);
+    for (size_t u = 0; u < units; u++) memset(row[u], 0, width * sizeof **row), memset(acc[u], 0, width * sizeof **acc);
     for (size_t i = begin; i < end; i++) {
-        k->add(n, row, term_of(s, unit, i, &n, buf), row);
-        if ((i - begin) % BLOCK == BLOCK - 1) flush(c, n, row, acc);
+        for (size_t u = 0; u < units; u++) {
+            size_t n;
+            const void *x = term_of(s, unit + u, i, &n, buf);
+            k->add(n, row[u], x, row[u]);
+        }
+        if ((i - begin) % BLOCK == BLOCK - 1 || i + 1 == end)
+            for (size_t u = 0; u < units; u++) flush(c, width, row[u], acc[u]);
     }
-    flush(c, n, row, acc);
-    return n;
 }
 
 /* n elements of y, times the factor. */
@@ -239,22 +246,31 @@ static void emit(const struct sum *s, size_t element, size_t n, double *v)
     dar_row_put(DAR_F64, v, y->dtype, at(y, element), n, s->b->add ? DAR_PUT_ADD : DAR_PUT);
 }
 
+/* n elements of y summed over a chunk of their terms. */
+static void store(const struct sum *s, size_t chunk, size_t element, size_t n, double *v)
+{
+    if (s->chunks == 1) emit(s, element, n, v);
+    else memcpy((double *)s->b->scratch + chunk * s->count + element, v, n * sizeof *v);
+}
+
 static void sum_task(void *ctx, size_t i, int thread)
 {
     const struct sum *s = ctx;
-    size_t chunk = i % s->chunks, unit = i / s->chunks * s->group, n = min(s->units - unit, s->group), element = unit;
+    size_t chunk = i % s->chunks, unit = i / s->chunks * s->group, n = min(s->units - unit, s->group);
     size_t begin = chunk * s->chunk, end = min(begin + s->chunk, s->terms);
-    double v[DAR_PIECE];
+    double v[BESIDE][DAR_PIECE];
     (void)thread;
 
     if (s->inner) {
-        for (size_t j = 0; j < n; j++) v[j] = sum_inner(s, unit + j, begin, end);
-    } else {
-        n = sum_outer(s, unit, begin, end, v);
-        element = unit / s->w.pieces * s->w.d[s->w.n - 1] + unit % s->w.pieces * DAR_PIECE;
+        for (size_t j = 0; j < n; j++) v[0][j] = sum_inner(s, unit + j, begin, end);
+        store(s, chunk, unit, n, v[0]);
+        return;
     }
-    if (s->chunks == 1) emit(s, element, n, v);
-    else memcpy((double *)s->b->scratch + chunk * s->count + element, v, n * sizeof *v);
+    sum_outer(s, unit, n, begin, end, v);
+    for (size_t j = 0; j < n; j++) {
+        size_t row = (unit + j) / s->w.pieces, piece = (unit + j) % s->w.pieces;
+        store(s, chunk, row * s->w.d[s->w.n - 1] + piece * DAR_PIECE, piece_length(&s->w, piece), v[j]);
+    }
 }
 
 static void add_chunks(void *ctx, size_t begin, size_t end, int thread)
