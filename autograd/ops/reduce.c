@@ -301,11 +301,16 @@ static double softmax_terms(const dar_shape *in, int n_in, const void *attr, int
     return (double)in[0].d[in[0].n - 1];
 }
 
+static dar_put softmax_put(const dar_opctx *c)
+{
+    return dar_put_for(dar_tensor_bytes(&c->y), false);
+}
+
 /* A row in arithmetic type, per thread, where y cannot hold it. */
 static size_t softmax_scratch(const dar_opctx *c, bool backward)
 {
     dar_dtype type = dar_op_compute(c);
-    if (backward || c->y.dtype == type) return 0;
+    if (backward || (c->y.dtype == type && softmax_put(c) == DAR_PUT)) return 0;
     return dar_mul_size(dar_mul_size(dar_tensor_cols(&c->y), dar_dtype_size(type)), (size_t)c->threads);
 }
 
@@ -323,16 +328,16 @@ static size_t mask_row(const dar_tensor *x, const dar_tensor *mask, size_t row, 
     return first;
 }
 
-/* x + mask. */
-static void masked_row(const dar_opctx *c, size_t row, void *to)
+/* x + mask: a row of x itself, or in `to`. */
+static const void *masked_row(const dar_opctx *c, size_t row, void *to)
 {
     const dar_tensor *x = &c->x[0], *mask = &c->x[1];
     dar_dtype type = dar_op_compute(c);
     size_t cols = dar_tensor_cols(x), size = dar_dtype_size(type), xs = dar_dtype_size(x->dtype);
     const char *from = (const char *)x->data + row * cols * xs;
 
+    if (!mask->data) return dar_row_get(type, x->dtype, from, cols, to);
     dar_row_convert(type, to, x->dtype, from, cols);
-    if (!mask->data) return;
     size_t step, first = mask_row(x, mask, row, &step);
     double buf[DAR_PIECE];
     for (size_t i = 0; i < cols; i += DAR_PIECE) {
@@ -340,6 +345,7 @@ static void masked_row(const dar_opctx *c, size_t row, void *to)
         const void *m = dar_bcast_get(type, mask, first + i * step, step, n, buf);
         dar_kern_for(type)->add(n, (char *)to + i * size, m, (char *)to + i * size);
     }
+    return to;
 }
 
 static void softmax_rows(void *ctx, size_t begin, size_t end, int thread)
@@ -348,14 +354,15 @@ static void softmax_rows(void *ctx, size_t begin, size_t end, int thread)
     dar_dtype type = dar_op_compute(c);
     const dar_kern *k = dar_kern_for(type);
     size_t cols = dar_tensor_cols(&c->y), size = dar_dtype_size(c->y.dtype);
+    char *buf = (char *)c->scratch + (size_t)thread * cols * dar_dtype_size(type);
+    dar_put mode = softmax_put(c);
 
     for (size_t row = begin; row < end; row++) {
-        void *y = (char *)c->y.data + row * cols * size;
-        void *e = c->y.dtype == type ? y : (char *)c->scratch + (size_t)thread * cols * dar_dtype_size(type);
-        masked_row(c, row, e);
-        double sum = k->exp_sum(cols, e, k->max(cols, e), e);
+        void *y = (char *)c->y.data + row * cols * size, *e = dar_row_out(type, c->y.dtype, y, mode, buf);
+        const void *x = masked_row(c, row, e);
+        double sum = k->exp_sum(cols, x, k->max(cols, x), e);
         k->scale(cols, sum == 0 ? 0 : 1 / sum, e, e); /* 0: every element is masked */
-        dar_row_put(type, e, c->y.dtype, y, cols, DAR_PUT);
+        dar_row_put(type, e, c->y.dtype, y, cols, mode);
     }
 }
 
