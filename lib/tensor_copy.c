@@ -11,12 +11,14 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define CHUNK       65536 /* elements per task, about */
-#define TILE_ROW    512   /* bytes of the row in a tile */
-#define TILE_ACROSS 256   /* elements of the other dimension: long runs in memory, and the second-level cache holds it \
-                           */
-#define MAX_WIDTH 8       /* bytes of an element */
-#define AHEAD     4096    /* bytes asked for before they are read, where shorter runs end unforeseen */
+#define CHUNK    65536 /* elements per task, about */
+#define TILE_ROW 512   /* bytes of the row in a tile */
+#define TILE_ACROSS                                                                                                    \
+    256                 /* elements of the other dimension: long runs in memory, and the second-level cache holds it   \
+                         */
+#define MAX_WIDTH  8    /* bytes of an element */
+#define STREAM_ROW 128  /* least bytes of a row that are worth streaming: its ends are parts of lines */
+#define AHEAD      4096 /* bytes asked for before they are read, where shorter runs end unforeseen */
 
 struct dim {
     size_t n;
@@ -150,10 +152,13 @@ static void put_piece(const struct walk *w, const struct part *p)
 static void put_tile(const struct walk *w, const struct part *p)
 {
     dar_dtype type = w->src->dtype;
-    size_t size = dar_dtype_size(type), m = part_m(w, p), n = part_n(w, p), ld = TILE_ROW / size;
+    size_t size = dar_dtype_size(type), m = part_m(w, p), n = part_n(w, p);
+    bool beside = w->other.dst == (int64_t)m; /* rows of dst lie one behind the other */
+    size_t ld = beside ? m : TILE_ROW / size;
     _Alignas(64) char y[TILE_ROW * TILE_ACROSS];
 
     dar_kern_for(DAR_F32)->transpose[type](m, n, address(w->src, p->src), (size_t)w->row.src, y, ld);
+    if (beside) m *= n, n = 1;
     for (size_t j = 0; j < n; j++)
         put_row(w, w->mode, address(w->dst, p->dst + (int64_t)j * w->other.dst), type, y + j * ld * size, m);
 }
@@ -161,9 +166,8 @@ static void put_tile(const struct walk *w, const struct part *p)
 static void ask(const struct walk *w, const struct part *p)
 {
     size_t size = dar_dtype_size(w->src->dtype), m = part_m(w, p), n = part_n(w, p);
-    if (!w->tiles) dar_row_ahead(address(w->src, p->src), m * size);
-    for (size_t i = 0; w->tiles && i < m; i++)
-        dar_row_ahead(address(w->src, p->src + (int64_t)i * w->row.src), n * size);
+    if (!w->tiles || w->row.src == (int64_t)n) n *= m, m = 1; /* one run */
+    for (size_t i = 0; i < m; i++) dar_row_ahead(address(w->src, p->src + (int64_t)i * w->row.src), n * size);
 }
 
 static void parts(void *ctx, size_t begin, size_t end, int thread)
@@ -219,6 +223,7 @@ static void move_parts(struct walk *w)
 
     w->m = w->row.n < m ? w->row.n : m;
     w->n = w->other.n < TILE_ACROSS ? w->other.n : TILE_ACROSS;
+    if (w->mode == DAR_PUT_STREAM && w->m * dar_dtype_size(w->dst->dtype) < STREAM_ROW) w->mode = DAR_PUT;
     w->step[w->steps++] =
         (struct dim){ (w->other.n + w->n - 1) / w->n, (int64_t)w->n * w->other.dst, (int64_t)w->n * w->other.src };
     w->step[w->steps++] =

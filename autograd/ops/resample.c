@@ -276,10 +276,67 @@ static void spread_rows(void *ctx, size_t begin, size_t end, int thread)
     }
 }
 
+/* ---------------------------------------------------------------- values that only change places */
+
+struct side {
+    int64_t n, fine, coarse; /* length, strides [elements] */
+};
+
+/* Every index of the relation, neighbours merged where both grids allow; at most 8. */
+static int sides_of(const struct grid *g, struct side *side)
+{
+    size_t row = g->Wf, frame = g->Hf * row, plane = g->Tc * g->Hc * g->Wc;
+    size_t B = dar_tensor_count(g->fine) / (g->Cf * g->Tf * frame), all[][3] = {
+        { B, g->Cf * g->Tf * frame, g->Cc * plane },
+        { g->Cf, g->Tf * frame, g->step_c * plane },
+        { g->ft, frame, g->step_a * plane },
+        { g->fs, row, g->step_b * plane },
+        { g->Tc, g->ft * frame, g->Hc * g->Wc },
+        { g->Hc, g->fs * row, g->Wc },
+        { g->Wc, g->fs, 1 },
+        { g->fs, 1, g->step_d * plane },
+    };
+    int n = 0;
+    for (size_t i = 0; i < DAR_COUNT(all); i++) {
+        struct side s = { (int64_t)all[i][0], (int64_t)all[i][1], (int64_t)all[i][2] }, *last = &side[n - 1];
+        if (s.n == 1) continue;
+        if (n && last->fine == s.n * s.fine && last->coarse == s.n * s.coarse) {
+            last->n *= s.n;
+            last->fine = s.fine;
+            last->coarse = s.coarse;
+        } else {
+            side[n++] = s;
+        }
+    }
+    return n;
+}
+
+/* One coarse element for each fine one: a permutation, if it has few enough dimensions.  Pairs are faster apart. */
+static bool permuted(const struct grid *g, bool up)
+{
+    struct side side[8];
+    if (g->G != 1 || g->front || g->fs == 2 || !dar_tensor_count(g->fine)) return false;
+    dar_tensor fine = *g->fine, coarse = *g->coarse;
+    int n = sides_of(g, side);
+    if (n > DAR_MAX_DIMS) return false;
+    fine.shape.n = n;
+    for (int i = 0; i < n; i++) {
+        fine.shape.d[i] = side[i].n;
+        fine.stride[i] = side[i].fine;
+        coarse.stride[i] = side[i].coarse;
+    }
+    coarse.shape = fine.shape;
+    (g->add ? dar_tensor_add : dar_tensor_copy)(up ? &fine : &coarse, up ? &coarse : &fine);
+    return true;
+}
+
+/* ---------------------------------------------------------------- both ways */
+
 #define CHUNK 32768 /* elements per task */
 
 static void gather(struct grid *g)
 {
+    if (permuted(g, false)) return;
     size_t n = dar_tensor_rows(g->coarse) / g->beside, chunk = CHUNK / (g->Wc * g->G * g->beside + 1);
     if (g->G > 1) g->work = dar_compute_type(g->fine->dtype);
     dar_parallel_range(n, chunk ? chunk : 1, gather_rows, g);
@@ -287,6 +344,7 @@ static void gather(struct grid *g)
 
 static void spread(struct grid *g)
 {
+    if (permuted(g, true)) return;
     size_t n = dar_tensor_rows(g->fine), chunk = CHUNK / (g->Wf + 1);
     dar_parallel_range(n, chunk ? chunk : 1, spread_rows, g);
 }
