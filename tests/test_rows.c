@@ -125,6 +125,51 @@ static void fills(void **state)
     }
 }
 
+/* ---------------------------------------------------------------- sums */
+
+/* Columns of several pieces, rows of several chunks; whole numbers, so that every order has the same sum. */
+static void sums_of_columns(void **state)
+{
+    (void)state;
+    static const dar_dtype types[] = { DAR_F64, DAR_F32, DAR_BF16 };
+    static const int64_t sizes[][2] = { { 300, 5003 }, { 7, 40000 }, { 5000, 3 } };
+    for (size_t s = 0; s < DAR_COUNT(sizes); s++)
+        for (size_t t = 0; t < DAR_COUNT(types); t++) {
+            dar_mark mark = dar_arena_mark(&arena);
+            size_t rows = (size_t)sizes[s][0], cols = (size_t)sizes[s][1];
+            dar_tensor x = dar_tensor_push(&arena, types[t], DAR_SHAPE(sizes[s][0], sizes[s][1]));
+            fill_whole(&x, 1);
+            dar_val *y = dar_sum(&tape, dar_leaf(&tape, x, NULL), 1, false);
+            for (size_t j = 0; j < cols; j++) {
+                double sum = 0;
+                for (size_t i = 0; i < rows; i++) sum += (double)((int)((i * cols + j) * 7 % 61) - 30);
+                CHECK_NEAR("sum of a column", dar_dtype_get(y->x.dtype, y->x.data, j), sum, 0);
+            }
+            dar_tape_clear(&tape);
+            dar_arena_reset(&arena, mark);
+        }
+}
+
+/* ---------------------------------------------------------------- softmax */
+
+/* A result too large for the caches is stored past them: the bits of a small one. */
+static void large_softmax(void **state)
+{
+    (void)state;
+    dar_mark mark = dar_arena_mark(&arena);
+    dar_tensor x = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(2100, 3001));
+    float *v = x.data;
+    for (size_t i = 0; i < dar_tensor_count(&x); i++) v[i] = (float)(i * 2654435761u % 4096) * 0x1p-9f;
+    dar_val *y = dar_softmax(&tape, dar_leaf(&tape, x, NULL), NULL);
+    for (int64_t row = 0; row < 2100; row += 2099) {
+        dar_val *one = dar_softmax(&tape, dar_leaf(&tape, dar_tensor_narrow(&x, 0, row, 1), NULL), NULL);
+        CHECK(memcmp(one->x.data, dar_tensor_at(&y->x, (size_t)row * 3001), 3001 * sizeof(float)) == 0,
+              "row %d of a large softmax has other bits", (int)row);
+    }
+    dar_tape_clear(&tape);
+    dar_arena_reset(&arena, mark);
+}
+
 /* ---------------------------------------------------------------- rope */
 
 static void positions(void **state)
@@ -216,12 +261,9 @@ static int teardown(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(copies_of_all_layouts),
-        cmocka_unit_test(large_copies),
-        cmocka_unit_test(fills),
-        cmocka_unit_test(positions),
-        cmocka_unit_test(norm_far_from_zero),
-        cmocka_unit_test(zero_rows),
+        cmocka_unit_test(copies_of_all_layouts), cmocka_unit_test(large_copies),  cmocka_unit_test(fills),
+        cmocka_unit_test(sums_of_columns),       cmocka_unit_test(large_softmax), cmocka_unit_test(positions),
+        cmocka_unit_test(norm_far_from_zero),    cmocka_unit_test(zero_rows),
     };
     return cmocka_run_group_tests(tests, setup, teardown) != 0;
 }
