@@ -100,8 +100,7 @@ $B/test_%: $B/tests/test_%.o $B/libdar.a
 
 $B/test_corpus: $(FUZZ:%=$B/tests/%.o)
 
-$B/test_net: $B/tests/net.o
-$B/test_dit $B/test_adapter $B/test_lora $B/test_scene: $B/tests/model.o
+$B/test_dit $B/test_adapter $B/test_lora $B/test_scene $B/test_step: $B/tests/model.o
 
 test: deps ## install what is missing, build, run every test; the last line counts them
 	@$(MAKE) --no-print-directory test-built
@@ -110,7 +109,7 @@ test: deps ## install what is missing, build, run every test; the last line coun
 test-built: $(TESTS:%=$B/%) $(PROGRAMS:%=$B/%)
 	@EXPECTED_SKIPS=$(if $(wildcard ../shared/assets/robot.glb),0,3) scripts/run-tests.sh $B $(TESTS)
 
-$B/bench_kernels: $(BENCH) $B/tests/net.o
+$B/bench_kernels: $(BENCH)
 $B/ulp: $B/tests/ulp.o
 $B/bench_kernels $B/ulp: $B/libdar.a
 	@echo "LD $@"

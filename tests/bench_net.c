@@ -1,59 +1,97 @@
-/* bench_net.c: rows of whole blocks of a diffusion transformer (tests/net.h): inference, and a training step of rank-32
- * LoRA (forward, loss, backward; nothing recomputed). */
+/* bench_net.c: rows of whole blocks of the transformer (models/dit.h): inference, and a training step of rank-32 LoRA
+ * (forward, loss, backward; nothing recomputed).  Keys and values of the text are made each time. */
 #include "tests/bench.h"
 
 #include "lib/status.h"
-#include "tests/net.h"
+#include "models/dit.h"
+#include "models/lora.h"
 
 #define RANK 32
 
+struct network {
+    dar_params p;
+    dar_dit m;
+};
+
 /* Sizes of a row: blocks, tokens (frames of 16 x 16), text tokens, width, heads, feed-forward width. */
 struct state {
-    net trained, plain; /* with LoRA; with its own weights alone, as after merging */
+    struct network trained, plain; /* with LoRA; with its own weights alone, as after merging */
+    dar_tensor tokens, text, target, rope, e0;
 };
+
+static dar_val *run(bench *b, const dar_dit *m)
+{
+    struct state *s = b->state;
+    dar_tape *t = &b->tape;
+    dar_dit_scene *scene = dar_tape_room(t, sizeof *scene);
+    dar_dit_text *x = dar_tape_room(t, sizeof *x);
+    dar_dit_moment e = { .e0 = dar_leaf(t, s->e0, NULL) };
+    *scene = (dar_dit_scene){ .frame = 256, .rope = dar_leaf(t, s->rope, NULL) };
+    dar_dit_text_prepare(t, m, &s->text, NULL, x);
+    dar_val *tokens = dar_contiguous(t, dar_leaf(t, s->tokens, NULL)); /* they may be written over */
+    return dar_dit_blocks(t, m, scene, x, &e, tokens);
+}
 
 static void forward(bench *b)
 {
     struct state *s = b->state;
     b->tape.recording = false;
-    net_forward(&b->tape, &s->plain, dar_leaf(&b->tape, s->plain.input, NULL));
+    run(b, &s->plain.m);
 }
 
 static void step(bench *b)
 {
     struct state *s = b->state;
     b->tape.recording = true;
-    dar_val *loss = net_loss(&b->tape, &s->trained, dar_leaf(&b->tape, s->trained.input, NULL));
-    dar_backward(&b->tape, loss, NULL);
+    dar_val *target = dar_leaf(&b->tape, s->target, NULL);
+    dar_backward(&b->tape, dar_squared_error(&b->tape, run(b, &s->trained.m), target, NULL, true), NULL);
 }
 
-static double planned(bench *b, void (*run)(bench *b))
+static double planned(bench *b, void (*fn)(bench *b))
 {
-    run(b);
+    fn(b);
     double flops = b->tape.cost.forward + b->tape.cost.backward;
     dar_tape_clear(&b->tape);
     dar_arena_reset(b->tape.arena, 0);
     return flops;
 }
 
-static void setup(bench *b)
+static void make(bench *b, struct network *n, int64_t rank)
 {
     const int64_t *s = b->s;
+    dar_dit_config c = { .layers = s[0], .width = s[3], .heads = s[4], .ffn = s[5] };
+    c.latent = c.patch = 1;
+    c.frequencies = 2;
+    c.text_width = 64;
+    c.text_keys = s[2];
+    c.eps = 1e-6;
+    dar_params_free(&n->p); /* of the row before */
+    dar_dit_free(&n->m);
+    dar_params_init(&n->p, b->arena, b->row->type);
+    dar_dit_init(&n->m, &n->p, &c, &(dar_adapter_config){ .unshuffle = 1 });
+    dar_lora_init(&n->m, &n->p, &(dar_lora_config){ .rank = rank, .alpha = 1, .targets = DAR_PROJECTIONS_ALL });
+    dar_params_train(&n->p, DAR_PARAM_LORA);
+    dar_params_fresh(&n->p, DAR_PARAM_ALL, 1);
+    dar_params_gradients(&n->p);
+    n->m.whole = true;
+}
+
+static void setup(bench *b)
+{
+    static struct state only;
+    struct state *s = b->state = &only;
     dar_arena plan;
     dar_err e;
-    net_size size = { .blocks = (int)s[0],
-                      .grid = { s[1] / 256, 16, 16 },
-                      .text = s[2],
-                      .width = s[3],
-                      .heads = s[4],
-                      .ffn = s[5],
-                      .storage = b->row->type,
-                      .whole = true };
-    struct state *st = b->state = dar_arena_push(b->arena, sizeof *st);
-    net_init(&st->plain, size, b->arena);
-    size.rank = RANK;
-    size.train = true;
-    net_init(&st->trained, size, b->arena);
+
+    make(b, &s->plain, 0);
+    make(b, &s->trained, RANK);
+    dar_dtype type = s->plain.p.main;
+    s->tokens = bench_tensor(b, type, DAR_SHAPE(1, b->s[1], b->s[3]));
+    s->target = bench_tensor(b, type, s->tokens.shape);
+    s->text = bench_tensor(b, type, DAR_SHAPE(1, b->s[2], 64));
+    s->e0 = bench_tensor(b, type, DAR_SHAPE(1, 2, 6 * b->s[3]));
+    s->rope = dar_tensor_push(b->arena, type, DAR_SHAPE(b->s[1], b->s[3] / b->s[4]));
+    dar_rope_table(&s->rope, b->s[1] / 256, 16, 16);
 
     DAR_ASSERT(dar_arena_init_plan(&plan, "plan", &e) == DAR_OK, "%s", e.text);
     DAR_ASSERT(dar_tape_init(&b->tape, &plan, &e) == DAR_OK, "%s", e.text);

@@ -62,7 +62,7 @@ void model_clip(model *o, int64_t frames, int64_t rows, int64_t columns, int64_t
 {
     const dar_dit_config *d = &o->c.dit;
     const dar_adapter_config *a = &o->c.adapter;
-    int64_t B = o->weights.plan ? 1 : 2, h = rows * d->patch, w = columns * d->patch, side = 2 * a->unshuffle;
+    int64_t B = o->c.dit.width < 1000 ? 2 : 1, h = rows * d->patch, w = columns * d->patch, side = 2 * a->unshuffle;
     dar_dtype main = o->p.main;
 
     o->clip = (dar_dit_clip){ .clips = B, .frames = frames, .height = h, .width = w };

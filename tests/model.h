@@ -30,7 +30,7 @@ dar_config model_preset(const char *name);
 void model_init(model *o, const dar_config *c, dar_dtype storage, bool plan);
 void model_free(model *o);
 
-/* Everything random: a clip of B = 2 of these latent frames and tokens, or of B = 1 when planning. */
+/* Everything random: two clips of these latent frames and tokens; one of a large model. */
 void model_clip(model *o, int64_t frames, int64_t rows, int64_t columns, int64_t text);
 
 /* Values of parameters and inputs as the files of scripts/make-dit-fixtures.py have them. */
