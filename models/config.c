@@ -44,6 +44,66 @@ static void read_adapter(dar_adapter_config *c, dar_json j)
     c->widen = (dar_widen)dar_json_choice(j, "widen", DAR_WIDEN_COPY, widen);
 }
 
+/* Numbers of a list that may be shorter than `most`; *n is their count. */
+static void read_list(dar_json j, const char *key, int most, int *n, int64_t *out)
+{
+    dar_json list = dar_json_get(j, key);
+    if (!list.item) return;
+    *n = 0;
+    for (dar_json x = dar_json_first(list); x.item; x = dar_json_next(x)) {
+        int64_t value = dar_json_int(x, NULL, DAR_JSON_NEEDED, 1, MOST);
+        if (*n < most) out[*n] = value;
+        ++*n;
+    }
+    if (*n < 1 || *n > most) dar_json_reject(j, key, "1 to %d numbers", most);
+}
+
+static void read_vae(dar_vae_config *c, dar_json j, int64_t latent)
+{
+    static const int64_t multipliers[] = { 1, 2, 4, 4 };
+    static const bool halve_time[] = { false, true, true };
+    if (!j.item) return;
+
+    int levels = DAR_COUNT(multipliers), i = 0;
+    memcpy(c->multipliers, multipliers, sizeof multipliers);
+    memcpy(c->halve_time, halve_time, sizeof halve_time);
+    read_list(j, "multipliers", DAR_VAE_LEVELS, &levels, c->multipliers);
+    c->levels = levels < 1 ? 1 : levels > DAR_VAE_LEVELS ? DAR_VAE_LEVELS : levels;
+    dar_json halve = dar_json_get(j, "halve_time");
+    for (dar_json x = dar_json_first(halve); x.item; x = dar_json_next(x), i++)
+        c->halve_time[i < DAR_VAE_LEVELS ? i : 0] = dar_json_bool(x, NULL, false);
+    if ((halve.item ? i : (int)DAR_COUNT(halve_time)) != c->levels - 1)
+        dar_json_reject(j, "halve_time", "one value less than multipliers");
+    c->patch = dar_json_int(j, "patch", 2, 1, 16);
+    c->encoder_width = dar_json_int(j, "encoder_width", 160, 1, MOST);
+    c->decoder_width = dar_json_int(j, "decoder_width", 256, 1, MOST);
+    c->encoder_blocks = dar_json_int(j, "encoder_blocks", 2, 1, DAR_VAE_BLOCKS);
+    c->decoder_blocks = dar_json_int(j, "decoder_blocks", 3, 1, DAR_VAE_BLOCKS);
+
+    c->latent = latent;
+    for (i = 0; i < DAR_VAE_LATENT; i++) c->mean[i] = 0, c->std[i] = 1;
+    if (latent > DAR_VAE_LATENT) {
+        dar_json_reject(j, NULL, "dit.latent of at most %d", DAR_VAE_LATENT);
+        return;
+    }
+    dar_json_numbers(j, "mean", c->mean, (size_t)latent);
+    dar_json_numbers(j, "std", c->std, (size_t)latent);
+    for (i = 0; i < (int)latent; i++)
+        if (!(c->std[i] > 0)) dar_json_reject(j, "std", "numbers above 0");
+}
+
+int64_t dar_vae_shrink(const dar_vae_config *c)
+{
+    return c->patch << (c->levels - 1);
+}
+
+int64_t dar_vae_shrink_time(const dar_vae_config *c)
+{
+    int64_t n = 1;
+    for (int i = 0; i < c->levels - 1; i++) n <<= c->halve_time[i];
+    return n;
+}
+
 static unsigned read_targets(dar_json j)
 {
     dar_json list = dar_json_get(j, "targets");
@@ -71,6 +131,7 @@ void dar_config_read(dar_config *c, dar_json j)
     snprintf(c->name, sizeof c->name, "%s", name ? name : "");
     read_dit(&c->dit, dar_json_object(j, "dit"));
     read_adapter(&c->adapter, dar_json_object(j, "adapter"));
+    read_vae(&c->vae, dar_json_get(j, "vae"), c->dit.latent);
     read_lora(&c->lora, dar_json_object(j, "lora"));
 }
 

@@ -23,6 +23,16 @@
  *   adapter.widen      copy | fresh    copy     what becomes of weights for fewer channels: copied, with zeros for the
  *                                               new ones, so that nothing changes at first; or made anew
  *
+ *   vae                object          absent   of the autoencoder, whose latent has dit.latent channels
+ *   vae.patch          1 .. 16         2        p: rows and columns of pixels made channels before anything else
+ *   vae.multipliers    list            1 2 4 4  widths of the levels; every level but the last halves the picture
+ *   vae.halve_time     list of bool    F T T    whether the step down from each level but the last halves time too
+ *   vae.encoder_width  1 ..            160      times multiplier: channels of a level
+ *   vae.decoder_width  1 ..            256
+ *   vae.encoder_blocks 1 .. 8          2        residual blocks per level
+ *   vae.decoder_blocks 1 .. 8          3
+ *   vae.mean, vae.std  lists           0, 1     per latent channel: the transformer sees (z - mean) / std
+ *
  *   lora.rank          0 ..            0        0: none
  *   lora.alpha         > 0             rank     the low-rank term counts alpha / rank times
  *   lora.targets       list of names   all ten  self_attn.q .k .v .o, cross_attn.q .k .v .o, ffn.0, ffn.2
@@ -77,10 +87,24 @@ typedef struct dar_lora_config {
     unsigned targets; /* bits 1 << dar_projection */
 } dar_lora_config;
 
+#define DAR_VAE_LEVELS 6
+#define DAR_VAE_BLOCKS 8
+#define DAR_VAE_LATENT 256
+
+typedef struct dar_vae_config {
+    int levels; /* 0: there is none */
+    int64_t latent, patch;
+    int64_t multipliers[DAR_VAE_LEVELS];
+    bool halve_time[DAR_VAE_LEVELS];
+    int64_t encoder_width, decoder_width, encoder_blocks, decoder_blocks;
+    double mean[DAR_VAE_LATENT], std[DAR_VAE_LATENT];
+} dar_vae_config;
+
 typedef struct dar_config {
     char name[64];
     dar_dit_config dit;
     dar_adapter_config adapter;
+    dar_vae_config vae;
     dar_lora_config lora;
 } dar_config;
 
@@ -89,6 +113,10 @@ void dar_config_read(dar_config *c, dar_json j);
 
 /* Read a file that holds nothing else.  On failure *c is undefined. */
 dar_status dar_config_open(dar_config *c, const char *path, dar_err *e);
+
+/* Pixels per latent row and column, and frames per latent frame after the first. */
+int64_t dar_vae_shrink(const dar_vae_config *c);
+int64_t dar_vae_shrink_time(const dar_vae_config *c);
 
 /* Channels of the patch embedding: noisy latent, mask, known latent. */
 int64_t dar_dit_channels(const dar_dit_config *c);

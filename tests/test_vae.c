@@ -1,0 +1,349 @@
+/* test_vae.c: the autoencoder against diffusers in f64, and against itself in pieces. */
+#include "tests/test.h"
+
+#include "lib/kern.h"
+#include "lib/rng.h"
+#include "lib/weights.h"
+#include "models/vae.h"
+
+typedef struct net {
+    dar_config c;
+    dar_arena weights, step, cache;
+    dar_params p;
+    dar_vae v;
+    dar_tape tape;
+} net;
+
+static dar_weights *open_fixture(const char *name)
+{
+    char path[128];
+    dar_weights *w;
+    dar_err e;
+    snprintf(path, sizeof path, "tests/fixtures/vae_%s.safetensors", name);
+    CHECK(dar_weights_open(&w, path, &e) == DAR_OK, "%s", e.text);
+    return w;
+}
+
+static dar_tensor stage(dar_weights *w, const char *name)
+{
+    dar_tensor x;
+    dar_err e;
+    CHECK(dar_weights_tensor(w, name, &x, &e) == DAR_OK, "%s", e.text);
+    return x;
+}
+
+/* The test preset with the fixture's weights, trainable or not. */
+static void net_init(net *n, dar_dtype storage, bool train)
+{
+    dar_err e;
+    memset(n, 0, sizeof *n);
+    CHECK(dar_config_open(&n->c, "models/presets/dar-test.json", &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_arena_init(&n->weights, "weights", 16 << 20, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_arena_init(&n->step, "step", 256 << 20, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_arena_init(&n->cache, "cache", 64 << 20, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_tape_init(&n->tape, &n->step, &e) == DAR_OK, "%s", e.text);
+    dar_params_init(&n->p, &n->weights, storage);
+    dar_vae_init(&n->v, &n->p, &n->c.vae);
+    if (train) dar_params_train(&n->p, DAR_PARAM_ALL);
+
+    dar_weights *w = open_fixture("weights");
+    assert_int_equal(dar_weights_count(w), n->p.count);
+    for (size_t i = 0; i < n->p.count; i++) {
+        dar_param *q = n->p.at[i];
+        dar_tensor x = stage(w, q->name);
+        dar_param_push(&n->p, q);
+        dar_tensor_copy(&q->x, &x);
+    }
+    dar_weights_close(w);
+    dar_params_gradients(&n->p);
+}
+
+static void net_free(net *n)
+{
+    dar_params_free(&n->p);
+    dar_tape_free(&n->tape);
+    dar_arena_free(&n->weights);
+    dar_arena_free(&n->step);
+    dar_arena_free(&n->cache);
+}
+
+static dar_val *input(net *n, const dar_tensor *x)
+{
+    dar_val *v = dar_input(&n->tape, n->p.main, x->shape);
+    dar_tensor_copy(&v->x, x);
+    return v;
+}
+
+/* Largest distance over the largest value. */
+static double distance(const dar_tensor *a, const dar_tensor *b)
+{
+    size_t count = dar_tensor_count(a);
+    double off = 0, most = 0;
+    assert_int_equal(count, dar_tensor_count(b));
+    for (size_t i = 0; i < count; i++) {
+        double x = dar_dtype_get(a->dtype, a->data, i), y = dar_dtype_get(b->dtype, b->data, i);
+        if (!(fabs(x - y) <= off)) off = fabs(x - y);
+        most = fmax(most, fabs(y));
+    }
+    return off / most;
+}
+
+/* ---------------------------------------------------------------- against the reference */
+
+static void parity(void **state)
+{
+    (void)state;
+    static const struct {
+        dar_dtype type;
+        double bound;
+    } runs[] = { { DAR_F64, 1e-10 }, { DAR_F32, 2e-5 }, { DAR_BF16, 6e-2 } };
+    dar_weights *s = open_fixture("stages");
+    dar_tensor x = stage(s, "x"), moments = stage(s, "moments"), z = stage(s, "z"), pixels = stage(s, "pixels");
+    for (size_t i = 0; i < DAR_COUNT(runs); i++) {
+        net n;
+        net_init(&n, runs[i].type, false);
+        n.tape.recording = false;
+        dar_val *m = dar_vae_encode(&n.tape, &n.v, input(&n, &x));
+        dar_val *latent = dar_vae_normalise(&n.tape, &n.v, dar_vae_mean(&n.tape, &n.v, m));
+        dar_val *y = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        dar_vae_fold(&n.v, &n.weights);
+        dar_val *folded = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        double d[] = { distance(&m->x, &moments), distance(&latent->x, &z), distance(&y->x, &pixels),
+                       distance(&folded->x, &pixels) };
+        printf("%s: moments %.1e, latent %.1e, pixels %.1e, folded %.1e\n", dar_dtype_name(runs[i].type), d[0], d[1],
+               d[2], d[3]);
+        for (int k = 0; k < 4; k++) CHECK_NEAR(dar_dtype_name(runs[i].type), d[k], 0, runs[i].bound);
+        net_free(&n);
+    }
+    dar_weights_close(s);
+}
+
+static dar_val *round_trip(net *n, dar_val *x)
+{
+    dar_tape *t = &n->tape;
+    dar_val *z = dar_vae_normalise(t, &n->v, dar_vae_mean(t, &n->v, dar_vae_encode(t, &n->v, x)));
+    return dar_squared_error(t, dar_vae_decode(t, &n->v, z), x, NULL, true);
+}
+
+static void gradients(void **state)
+{
+    (void)state;
+    static const struct {
+        dar_dtype type;
+        double bound;
+    } runs[] = { { DAR_F64, 1e-9 }, { DAR_F32, 1e-4 } };
+    dar_weights *s = open_fixture("stages");
+    dar_tensor x = stage(s, "x"), loss = stage(s, "loss");
+    for (size_t i = 0; i < DAR_COUNT(runs); i++) {
+        net n;
+        net_init(&n, runs[i].type, true);
+        dar_val *found = round_trip(&n, input(&n, &x));
+        CHECK_NEAR("loss", dar_dtype_get(n.p.main, found->x.data, 0), *(const double *)loss.data, runs[i].bound);
+        dar_backward(&n.tape, found, NULL);
+        double worst = 0;
+        for (size_t k = 0; k < n.p.count; k++) {
+            char name[128];
+            snprintf(name, sizeof name, "grad.%s", n.p.at[k]->name);
+            dar_tensor g = stage(s, name);
+            double d = distance(&n.p.at[k]->g, &g);
+            CHECK(d <= runs[i].bound, "%s: %.2e", name, d);
+            worst = fmax(worst, d);
+        }
+        printf("%s: worst gradient %.1e of %zu\n", dar_dtype_name(runs[i].type), worst, n.p.count);
+        net_free(&n);
+    }
+    dar_weights_close(s);
+}
+
+/* ---------------------------------------------------------------- in pieces */
+
+typedef struct frames {
+    const dar_tensor *whole; /* [1, 3, F, H, W] */
+    int64_t next;
+} frames;
+
+/* The frame is that of the whole clip, bit for bit but for the clamp. */
+static dar_status compare(void *ctx, const dar_tensor *frame, int64_t index, dar_err *e)
+{
+    frames *f = ctx;
+    (void)e;
+    assert_int_equal(index, f->next++);
+    size_t pixels = (size_t)(frame->shape.d[3] * frame->shape.d[4]), F = (size_t)f->whole->shape.d[2];
+    for (size_t c = 0; c < 3; c++)
+        for (size_t i = 0; i < pixels; i++) {
+            double y = dar_dtype_get(f->whole->dtype, f->whole->data, (c * F + (size_t)index) * pixels + i);
+            CHECK_NEAR("frame", dar_dtype_get(frame->dtype, frame->data, c * pixels + i), fmax(-1, fmin(1, y)), 0);
+        }
+    return DAR_OK;
+}
+
+static void decoding_in_pieces(void **state)
+{
+    (void)state;
+    dar_weights *s = open_fixture("stages");
+    dar_tensor z = stage(s, "z");
+    for (int type = DAR_F64; type <= DAR_BF16; type++) {
+        net n;
+        net_init(&n, (dar_dtype)type, false);
+        dar_vae_fold(&n.v, &n.weights);
+        n.tape.recording = false;
+        dar_val *whole = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        frames f = { .whole = &whole->x };
+        dar_vae_stream stream;
+        dar_vae_stream_init(&stream, &n.v, DAR_VAE_DECODER, &n.cache);
+        for (int64_t k = 0; k < z.shape.d[2]; k++) {
+            dar_tensor piece = dar_tensor_narrow(&z, 2, k, 1);
+            size_t used = n.step.used;
+            dar_val *in = input(&n, &piece);
+            size_t with = n.step.used;
+            assert_int_equal(dar_vae_decode_next(&stream, &n.tape, in, compare, &f, NULL), DAR_OK);
+            assert_int_equal(n.step.used, with);
+            dar_arena_reset(&n.step, used);
+        }
+        assert_int_equal(f.next, 9);
+        net_free(&n);
+    }
+    dar_weights_close(s);
+}
+
+/* Encode a clip of F frames in pieces; every latent frame has the bits of the whole.  Returns the parts skipped. */
+static int64_t encode_in_pieces(net *n, const dar_tensor *x, bool skip)
+{
+    dar_val *whole = dar_vae_encode(&n->tape, &n->v, input(n, x));
+    dar_vae_stream s;
+    dar_mark cache = dar_arena_mark(&n->cache);
+    dar_vae_stream_init(&s, &n->v, DAR_VAE_ENCODER, &n->cache);
+    s.skip = skip;
+    int64_t step = dar_vae_shrink_time(&n->c.vae), at = 0;
+    for (int64_t k = 0; k < whole->x.shape.d[2]; k++) {
+        int64_t count = k ? step : 1;
+        dar_tensor piece = dar_tensor_narrow(x, 2, at, count), expected = dar_tensor_narrow(&whole->x, 2, k, 1);
+        dar_mark m = dar_arena_mark(&n->step);
+        dar_val *in = input(n, &piece), *y = dar_vae_encode_next(&s, &n->tape, in);
+        dar_tensor same = dar_tensor_push(&n->step, expected.dtype, expected.shape);
+        dar_tensor_copy(&same, &expected);
+        assert_memory_equal(y->x.data, same.data, dar_tensor_bytes(&same));
+        dar_arena_reset(&n->step, m);
+        at += count;
+    }
+    dar_arena_reset(&n->cache, cache);
+    return s.skipped;
+}
+
+static void encoding_in_pieces(void **state)
+{
+    (void)state;
+    for (int type = DAR_F64; type <= DAR_BF16; type++) {
+        net n;
+        net_init(&n, (dar_dtype)type, false);
+        n.tape.recording = false;
+        /* A reference picture, then nothing for a while, something, nothing: what must not be skipped is not. */
+        dar_tensor x = dar_tensor_push(&n.weights, n.p.main, DAR_SHAPE(1, 3, 77, 32, 16));
+        dar_rng_fill_uniform(&x, 1, 2, -1, 1);
+        int64_t moving = encode_in_pieces(&n, &x, true);
+        assert_int_equal(moving, 0);
+        for (int k = 0; k < 2; k++) {
+            dar_tensor still = dar_tensor_narrow(&x, 2, k ? 45 : 1, k ? 32 : 43);
+            dar_tensor_fill(&still, 0);
+        }
+        int64_t skipped = encode_in_pieces(&n, &x, true);
+        printf("%s: %lld of %d parts skipped\n", dar_dtype_name((dar_dtype)type), (long long)skipped, 5 * 20);
+        CHECK(skipped >= 20, "%lld parts skipped", (long long)skipped);
+        assert_int_equal(encode_in_pieces(&n, &x, false), 0);
+        net_free(&n);
+    }
+}
+
+/* Latent frame k depends on frames up to 4 k alone. */
+static void causality(void **state)
+{
+    (void)state;
+    net n;
+    net_init(&n, DAR_F32, false);
+    n.tape.recording = false;
+    dar_tensor x = dar_tensor_push(&n.weights, DAR_F32, DAR_SHAPE(1, 3, 9, 16, 16));
+    dar_rng_fill_uniform(&x, 1, 2, -1, 1);
+    dar_val *before = dar_vae_encode(&n.tape, &n.v, input(&n, &x));
+    dar_tensor frame = dar_tensor_narrow(&x, 2, 5, 1);
+    dar_tensor_fill(&frame, 0.5);
+    dar_val *after = dar_vae_encode(&n.tape, &n.v, input(&n, &x));
+    const float *a = before->x.data, *b = after->x.data;
+    int64_t C = before->x.shape.d[1];
+    for (int64_t c = 0; c < C; c++) {
+        for (int k = 0; k < 2; k++) CHECK_NEAR("earlier latent", b[3 * c + k], a[3 * c + k], 0);
+        CHECK(b[3 * c + 2] != a[3 * c + 2], "channel %lld of the last latent frame did not see frame 5", (long long)c);
+    }
+    net_free(&n);
+}
+
+static void same_bits(void **state)
+{
+    (void)state;
+    dar_weights *s = open_fixture("stages");
+    dar_tensor z = stage(s, "z");
+    int before = dar_threads();
+    static const int threads[] = { 1, 2, 3, 7 };
+    unsigned char *kept = NULL;
+    for (int i = 0; i < 4; i++) {
+        net n;
+        dar_threads_set(threads[i]);
+        net_init(&n, DAR_F32, false);
+        n.tape.recording = false;
+        dar_val *y = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        size_t bytes = dar_tensor_bytes(&y->x);
+        if (!kept) memcpy(kept = malloc(bytes), y->x.data, bytes);
+        else assert_memory_equal(kept, y->x.data, bytes);
+        net_free(&n);
+    }
+    free(kept);
+    dar_threads_set(before);
+    dar_weights_close(s);
+}
+
+/* ---------------------------------------------------------------- the real sizes */
+
+static void real_sizes(void **state)
+{
+    (void)state;
+    dar_config c;
+    dar_err e;
+    dar_arena a;
+    dar_params p;
+    dar_vae v;
+    dar_tape t;
+    CHECK(dar_config_open(&c, "models/presets/wan22-fun-5b.json", &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_vae_shrink(&c.vae), 16);
+    assert_int_equal(dar_vae_shrink_time(&c.vae), 4);
+    assert_int_equal(dar_arena_init_plan(&a, "plan", &e), DAR_OK);
+    assert_int_equal(dar_tape_init(&t, &a, &e), DAR_OK);
+    dar_params_init(&p, &a, DAR_F32);
+    dar_vae_init(&v, &p, &c.vae);
+    assert_int_equal(p.count, 196);
+    assert_int_equal(dar_params_count(&p, DAR_PARAM_ALL), 704688668);
+    dar_params_fresh(&p, DAR_PARAM_ALL, 0);
+
+    /* Work of a clip: 597 and 113.5 TFLOP at 480 x 832 x 81. */
+    t.recording = false;
+    dar_vae_decode(&t, &v, dar_input(&t, DAR_F32, DAR_SHAPE(1, 48, 21, 30, 52)));
+    CHECK_NEAR("decoder [TFLOP]", t.cost.forward / 1e12, 597, 6);
+    dar_tape_clear(&t);
+    dar_vae_encode(&t, &v, dar_input(&t, DAR_F32, DAR_SHAPE(1, 3, 81, 480, 832)));
+    CHECK_NEAR("encoder [TFLOP]", t.cost.forward / 1e12, 113.5, 1.5);
+    dar_tape_free(&t);
+    dar_params_free(&p);
+    dar_arena_free(&a);
+}
+
+int main(void)
+{
+    static const struct CMUnitTest tests[] = {
+        cmocka_unit_test(parity),
+        cmocka_unit_test(gradients),
+        cmocka_unit_test(decoding_in_pieces),
+        cmocka_unit_test(encoding_in_pieces),
+        cmocka_unit_test(causality),
+        cmocka_unit_test(same_bits),
+        cmocka_unit_test(real_sizes),
+    };
+    return cmocka_run_group_tests_name("vae", tests, NULL, NULL) != 0;
+}
