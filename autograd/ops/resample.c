@@ -406,6 +406,7 @@ static const struct attr patchify = { 0, 1, 2, 0, DAR_PIXELS_COLUMNS };
 static const struct attr frames_2 = { 0, 2, 1, 0, DAR_FRAMES_FIRST }, frames_1 = { 0, 1, 1, 0, DAR_FRAMES_FIRST };
 static const struct attr down_space = { 3, 1, 2, 0, DAR_PIXELS_ROWS }, down_both = { 6, 2, 2, 0, DAR_PIXELS_ROWS };
 static const struct attr down_one = { 3, 1, 1, 0, DAR_PIXELS_ROWS }, down_three = { 2, 3, 1, 0, DAR_PIXELS_ROWS };
+static const struct attr all_apart = { 36, 2, 3, 0, DAR_PIXELS_ROWS }, all_together = { 2, 2, 3, 0, DAR_PIXELS_ROWS };
 
 static const dar_sample down_samples[] = {
     { .in = { { 4, { 1, 1, 2, 2 } } }, .attr = &unshuffle_2 },     /* one coarse pixel */
@@ -421,6 +422,8 @@ static const dar_sample down_samples[] = {
     { .in = { { 5, { 1, 3, 4, 4, 6 } } }, .attr = &down_both },    /* whole groups */
     { .in = { { 5, { 1, 3, 5, 4, 6 } } }, .attr = &down_both },    /* both */
     { .in = { { 4, { 2, 3, 2, 5 } } }, .attr = &down_one },        /* identity */
+    { .in = { { 5, { 2, 2, 4, 6, 9 } } }, .attr = &all_apart },    /* a permutation of seven dimensions */
+    { .in = { { 5, { 1, 2, 3, 6, 9 } } }, .attr = &all_apart },    /* half a group in front */
     { .in = { { 5, { 1, 4, 4, 2, 3 } } }, .attr = &down_three },   /* groups cross channels, two zero frames */
 };
 
@@ -494,18 +497,19 @@ static const struct attr up_both = { 2, 2, 2, 0, DAR_PIXELS_ROWS }, up_first = {
 static const struct attr up_halve = { 2, 1, 2, 0, DAR_PIXELS_ROWS };
 
 static const dar_sample up_samples[] = {
-    { .in = { { 4, { 1, 4, 1, 1 } } }, .attr = &unshuffle_2 },     /* one coarse pixel */
-    { .in = { { 4, { 2, 12, 2, 5 } } }, .attr = &unshuffle_2 },    /* torch's order */
-    { .in = { { 5, { 1, 18, 2, 2, 3 } } }, .attr = &unshuffle_3 }, /* per frame, odd factor */
-    { .in = { { 4, { 2, 12, 2, 5 } } }, .attr = &patchify },       /* columns first */
-    { .in = { { 5, { 1, 4, 3, 2, 3 } } }, .attr = &patchify },     /* per frame */
-    { .in = { { 5, { 2, 6, 2, 2, 5 } } }, .attr = &frames_2 },     /* channels to frames */
-    { .in = { { 4, { 2, 3, 2, 5 } } }, .attr = &nearest_2 },       /* nearest */
-    { .in = { { 5, { 1, 2, 2, 3, 5 } } }, .attr = &nearest_3 },    /* per frame, odd factor */
-    { .in = { { 5, { 2, 2, 3, 2, 3 } } }, .attr = &up_both },      /* duplicate in time and space */
-    { .in = { { 5, { 1, 2, 3, 2, 3 } } }, .attr = &up_first },     /* first frame lost */
-    { .in = { { 5, { 1, 4, 1, 2, 3 } } }, .attr = &up_first },     /* lone first frame */
-    { .in = { { 5, { 1, 4, 2, 2, 3 } } }, .attr = &up_halve },     /* row parity picks the channel */
+    { .in = { { 4, { 1, 4, 1, 1 } } }, .attr = &unshuffle_2 },      /* one coarse pixel */
+    { .in = { { 4, { 2, 12, 2, 5 } } }, .attr = &unshuffle_2 },     /* torch's order */
+    { .in = { { 5, { 1, 18, 2, 2, 3 } } }, .attr = &unshuffle_3 },  /* per frame, odd factor */
+    { .in = { { 4, { 2, 12, 2, 5 } } }, .attr = &patchify },        /* columns first */
+    { .in = { { 5, { 1, 4, 3, 2, 3 } } }, .attr = &patchify },      /* per frame */
+    { .in = { { 5, { 2, 6, 2, 2, 5 } } }, .attr = &frames_2 },      /* channels to frames */
+    { .in = { { 4, { 2, 3, 2, 5 } } }, .attr = &nearest_2 },        /* nearest */
+    { .in = { { 5, { 1, 2, 2, 3, 5 } } }, .attr = &nearest_3 },     /* per frame, odd factor */
+    { .in = { { 5, { 2, 2, 3, 2, 3 } } }, .attr = &up_both },       /* duplicate in time and space */
+    { .in = { { 5, { 1, 2, 3, 2, 3 } } }, .attr = &up_first },      /* first frame lost */
+    { .in = { { 5, { 1, 4, 1, 2, 3 } } }, .attr = &up_first },      /* lone first frame */
+    { .in = { { 5, { 2, 36, 2, 2, 3 } } }, .attr = &all_together }, /* a permutation of seven dimensions */
+    { .in = { { 5, { 1, 4, 2, 2, 3 } } }, .attr = &up_halve },      /* row parity picks the channel */
 };
 
 static const struct attr up_bad_front = { 2, 2, 1, 2, DAR_PIXELS_ROWS };

@@ -173,12 +173,12 @@ static dar_tensor permute_view(const dar_tensor *x, const void *attr)
 }
 
 static const struct order order_102 = { { 1, 0, 2 } }, order_201 = { { 2, 0, 1 } }, order_same = { { 0, 1, 2 } },
-                          order_twice = { { 0, 1, 1 } };
+                          order_10 = { { 1, 0 } }, order_03142 = { { 0, 3, 1, 4, 2 } }, order_twice = { { 0, 1, 1 } };
 
 static const dar_sample permute_samples[] = {
-    { .in = { { 3, { 2, 3, 5 } } }, .attr = &order_102 },
-    { .in = { { 3, { 2, 3, 5 } } }, .attr = &order_201 },
-    { .in = { { 3, { 2, 3, 5 } } }, .attr = &order_same },
+    { .in = { { 3, { 2, 3, 5 } } }, .attr = &order_102 },         { .in = { { 3, { 2, 3, 5 } } }, .attr = &order_201 },
+    { .in = { { 3, { 2, 3, 5 } } }, .attr = &order_same },        { .in = { { 2, { 67, 35 } } }, .attr = &order_10 },
+    { .in = { { 5, { 2, 3, 4, 5, 7 } } }, .attr = &order_03142 },
 };
 
 static const dar_error_sample permute_errors[] = { { .in = { { 3, { 2, 3, 5 } } }, .attr = &order_twice } };
@@ -244,12 +244,21 @@ static void concat_backward(const dar_opctx *c)
 
 static const int dim_0 = 0, dim_1 = 1, dim_2 = 2;
 
+#define LINE(n)                                                                                                        \
+    {                                                                                                                  \
+        2,                                                                                                             \
+        {                                                                                                              \
+            3, n                                                                                                       \
+        }                                                                                                              \
+    }
 static const dar_sample concat_samples[] = {
     { .in = { { 1, { 1 } }, { -1, { 0 } } }, .attr = &dim_0 },
     { .in = { { 2, { 2, 3 } }, { 2, { 5, 3 } }, { -1, { 0 } } }, .attr = &dim_0 },
     { .in = { { 3, { 2, 3, 5 } }, { 3, { 2, 1, 5 } }, { 3, { 2, 4, 5 } }, { -1, { 0 } } }, .attr = &dim_1 },
     { .in = { { 3, { 2, 3, 5 } }, { 3, { 2, 3, 5 } }, { -1, { 0 } } }, .attr = &dim_2 },
+    { .in = { LINE(1), LINE(3), LINE(2), LINE(1), LINE(5), LINE(1), LINE(2), LINE(4) }, .attr = &dim_1 }, /* the most */
 };
+#undef LINE
 
 static const dar_error_sample concat_errors[] = {
     { .in = { { 2, { 2, 3 } }, { 2, { 2, 4 } }, { -1, { 0 } } }, .attr = &dim_0 },
