@@ -176,7 +176,24 @@ void dar_identity_init(dar_identity *d, const dar_scene *s, dar_arena *a)
         d->first[i] = d->parts;
         d->parts += d->mesh[s->instance[i].mesh].parts;
     }
-    for (d->side = 1; d->side * d->side * d->side < d->parts;) d->side++;
+    d->side = dar_identity_side(d->parts);
+}
+
+size_t dar_identity_side(size_t parts)
+{
+    size_t side = 1;
+    while (side * side * side < parts) side++;
+    return side;
+}
+
+size_t dar_identity_cell_of(size_t side, const double q[3])
+{
+    size_t cell = 0;
+    for (int c = 2; c >= 0; c--) {
+        double x = floor(q[c] * (double)side);
+        cell = cell * side + (x > 0 ? x < (double)side ? (size_t)x : side - 1 : 0);
+    }
+    return cell;
 }
 
 void dar_identity_cell(const dar_identity *d, size_t instance, uint32_t part, double origin[3], double *scale)

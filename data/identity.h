@@ -40,4 +40,8 @@ void dar_identity_init(dar_identity *d, const dar_scene *s, dar_arena *a);
 /* The colours of part `part` of an instance: q = origin + scale x. */
 void dar_identity_cell(const dar_identity *d, size_t instance, uint32_t part, double origin[3], double *scale);
 
+/* side of the cube of so many parts, and the cell that a colour lies in: with number first[instance] + part. */
+size_t dar_identity_side(size_t parts);
+size_t dar_identity_cell_of(size_t side, const double q[3]);
+
 #endif
