@@ -7,7 +7,10 @@
  *   tiles                       along the rows first: the stripe of B is read again and again, A streams past it
  *
  * With few rows (thin) the packing of B outweighs its use by the tiles: each task packs its own piece of B and uses it
- * at once, or reads B where it lies, while A is packed once and shared. */
+ * at once, while A is packed once and shared.
+ *
+ * B that lies ready is not packed for up to IN_PLACE_ROWS: the first tile of a stripe brings the next stripe near, from
+ * where the other tiles read it as fast as if it were packed. */
 #include "lib/product.h"
 
 #include <stdint.h>
@@ -18,7 +21,8 @@
 
 #define THIN_ROWS        96
 #define TASK_ROWS        192
-#define TASK_ROWS_APART  96 /* where sums are kept apart from C */
+#define TASK_ROWS_APART  96   /* where sums are kept apart from C */
+#define IN_PLACE_ROWS    1536 /* of A, that read B where it lies */
 #define BLOCK_UNITS      512
 #define BLOCK_UNITS_THIN 128
 #define SPAN_UNITS       1024
@@ -32,6 +36,7 @@ struct plan {
     const dar_product *p;
     const dar_tile *t;
     bool thin;
+    bool share;        /* stripes are packed for all threads */
     bool stream;       /* C past the caches, being written once and not read */
     size_t rows, cols; /* stripes of A, of B */
     size_t panel;      /* stripes of B packed at a time */
@@ -91,6 +96,19 @@ static void cut_k(struct plan *s, size_t units)
     if (!s->blocks) s->blocks = 1; /* nothing to sum: C is cleared, or kept */
 }
 
+/* Whether an operand is read where it lies. */
+static bool lies(const dar_product *p, const dar_operand *x, bool of_a)
+{
+    return x->in_place && (of_a || p->m <= IN_PLACE_ROWS);
+}
+
+static bool packs(const dar_product *p, bool of_a)
+{
+    bool some = false;
+    for (int i = 0; i < 2; i++) some |= p->term[i].k && !lies(p, of_a ? &p->term[i].a : &p->term[i].b, of_a);
+    return some;
+}
+
 static void cut(struct plan *s, const dar_product *p)
 {
     const dar_tile *t = p->tile;
@@ -98,12 +116,13 @@ static void cut(struct plan *s, const dar_product *p)
 
     *s = (struct plan){ .p = p, .t = t, .rows = ceil_div(p->m, t->mr), .cols = ceil_div(p->n, t->nr) };
     s->thin = p->m <= THIN_ROWS;
+    s->share = packs(p, s->thin);
     s->spans = 1;
     cut_k(s, s->thin ? BLOCK_UNITS_THIN : BLOCK_UNITS);
 
     size_t stripe_a = s->depth * t->mr * t->unit_bytes, stripe_b = s->depth * t->nr * t->unit_bytes;
     size_t elem = t->kind == DAR_TILE_F64 ? 8 : 4;
-    bool pack_a = (p->term[0].k && !p->term[0].a.in_place) || (p->term[1].k && !p->term[1].a.in_place);
+    bool pack_a = packs(p, true);
     bool apart = !p->direct && s->blocks > 1; /* else a finished tile leaves its scratch at once */
     size_t task_rows = apart ? TASK_ROWS_APART : TASK_ROWS;
     size_t want = threads * (s->thin ? 2 : pack_a ? 1 : 8); /* tasks: many even out, few pack less often */
@@ -116,8 +135,8 @@ static void cut(struct plan *s, const dar_product *p)
         s->piece = ceil_div(s->cols, s->tn);
     } else {
         size_t units = dar_tile_units(t, p->term[0].k) + dar_tile_units(t, p->term[1].k);
-        if (p->direct && units > SPAN_UNITS) s->spans = min(s->blocks, units / SPAN_UNITS);
-        size_t fit = 1 + PANEL_BYTES / (ceil_div(s->blocks, s->spans) * stripe_b);
+        if (s->share && p->direct && units > SPAN_UNITS) s->spans = min(s->blocks, units / SPAN_UNITS);
+        size_t fit = s->share ? 1 + PANEL_BYTES / (ceil_div(s->blocks, s->spans) * stripe_b) : s->cols;
         s->panel = ceil_div(s->cols, ceil_div(s->cols, fit));
         s->tm = ceil_div(p->m, task_rows);
         if (s->tm > threads) s->tm = min(s->rows, ceil_div(s->tm, threads) * threads);
@@ -126,7 +145,8 @@ static void cut(struct plan *s, const dar_product *p)
     }
     s->stream = p->direct && !p->done && s->blocks == 1 && dar_put_for(p->m * p->n * elem, p->add) == DAR_PUT_STREAM;
     s->task_rows = ceil_div(s->rows, s->tm);
-    s->shared_bytes = align(ceil_div(s->blocks, s->spans) * (s->thin ? s->rows * stripe_a : s->panel * stripe_b));
+    size_t shared = ceil_div(s->blocks, s->spans) * (s->thin ? s->rows * stripe_a : s->panel * stripe_b);
+    s->shared_bytes = s->share ? align(shared) : 0;
     s->a_bytes = s->thin || !pack_a ? 0 : align(s->task_rows * stripe_a);
     s->b_bytes = s->thin ? align(s->piece * stripe_b) : 0;
     s->c_bytes = p->direct ? 0 : align((apart ? s->task_rows * s->piece : 1) * t->mr * t->nr * elem);
@@ -158,7 +178,7 @@ static void pack(const struct plan *s, bool of_a, size_t begin, size_t end, size
     const dar_operand *x = of_a ? &term->a : &term->b;
     size_t step = x->many ? end - begin : 1, bytes = stripe_bytes(s, of_a, b);
 
-    if (!k || (x->in_place && (of_a || s->thin))) return;
+    if (!k || lies(s->p, x, of_a)) return;
     for (size_t i = begin; i < end; i += step, dst += bytes * step) {
         size_t at = i * wide, last = min(lanes, (i + step) * wide);
         x->pack(x->ctx, s->t, at, last - at, k0, k, dst);
@@ -214,7 +234,7 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
     const dar_tile *t = s->t;
     size_t k0, k, stripe_a = stripe_bytes(s, true, b), stripe_b = stripe_bytes(s, false, b), ldc;
     const dar_term *term = block(s, b, &k0, &k);
-    const dar_operand *in_a = term->a.in_place ? &term->a : NULL, *in_b = s->thin && term->b.in_place ? &term->b : NULL;
+    const dar_operand *in_a = term->a.in_place ? &term->a : NULL, *in_b = lies(s->p, &term->b, false) ? &term->b : NULL;
     const char *as = s->thin ? shared_block(s, b) + w->r0 * stripe_a : w->a;
     const char *bs = s->thin ? w->b : shared_block(s, b) + (w->c0 - s->first) * stripe_b;
     dar_put put = b || (s->p->direct && s->p->add) ? DAR_PUT_ADD : s->stream ? DAR_PUT_STREAM : DAR_PUT;
@@ -235,7 +255,8 @@ static void multiply_block(const struct plan *s, const struct task *w, size_t b)
             } else if (term->a.by_row) {
                 a_row = dar_tile_units(t, k), a_k = 1;
             }
-            (in_b ? t->mm_beside : t->mm)(dar_tile_units(t, k), pa, a_row, a_k, pb, b_k, c, ldc, m, n, put);
+            (in_b && i == w->r0 ? t->mm_beside : t->mm)(dar_tile_units(t, k), pa, a_row, a_k, pb, b_k, c, ldc, m, n,
+                                                        put);
             if (last && s->p->done) s->p->done(s->p->ctx, i * t->mr, j * t->nr, m, n, c, ldc);
         }
     }
@@ -270,7 +291,7 @@ void dar_product_run(const dar_product *p, void *scratch)
     s.own = s.shared + s.shared_bytes;
     s.b1 = s.blocks;
     if (s.thin) {
-        share(&s, s.rows);
+        if (s.share) share(&s, s.rows);
         dar_parallel(s.tn, multiply, &s);
         return;
     }
@@ -279,7 +300,7 @@ void dar_product_run(const dar_product *p, void *scratch)
         s.b1 = s.blocks * (i + 1) / s.spans;
         for (s.first = 0; s.first < s.cols; s.first += s.panel) {
             size_t panel = min(s.panel, s.cols - s.first);
-            share(&s, panel);
+            if (s.share) share(&s, panel);
             dar_parallel(s.tm * s.tn, multiply, &s);
         }
     }

@@ -190,7 +190,8 @@ static void small(void)
 static void medium(void)
 {
     static const size_t shape[][3] = {
-        { 97, 63, 40 }, { 193, 65, 33 }, { 108, 16, 600 }, { 13, 130, 700 }, { 101, 70, 1100 }, { 200, 17, 31 },
+        { 97, 63, 40 },    { 193, 65, 33 }, { 108, 16, 600 }, { 13, 130, 700 },
+        { 101, 70, 1100 }, { 200, 17, 31 }, { 1600, 16, 20 },
     };
     for (size_t o = 0; o < DAR_COUNT(operands); o++)
         for (size_t s = 0; has(operands[o].kind) && s < DAR_COUNT(shape); s++)
