@@ -26,7 +26,7 @@ typedef struct dar_safetensors_options {
  * if it was there, so that the name means one thing; shards of an older index stay.
  *
  * Data begins at a multiple of 64 bytes, larger elements first, so every tensor is aligned to its element.  Same
- * tensors, same bytes.  Aborts if a name is not one the reader takes (safetensors.h) or comes twice.  `o` may be NULL.
+ * tensors, same bytes.  Aborts if a name is not one the reader takes (weights.h) or comes twice.  `o` may be NULL.
  */
 dar_status dar_safetensors_write(const char *path, const dar_safetensors_item *item, size_t n,
                                  const dar_safetensors_options *o, dar_err *e);

@@ -1,0 +1,29 @@
+/* load.h: weights of a file into a network: by name, shape and type out of the network's own table.
+ *
+ * Names may be those of the public checkpoint, with model. or model.diffusion_model. before them, or those of
+ * diffusers; which, is told by how many of them are there.  A parameter that is frozen and stored as it is declared
+ * becomes a view of the mapped file, so loading a bf16 network costs no more than touching it, and the file must stay
+ * open.
+ *
+ * Every tensor that is missing, of another shape or type, or not used is logged with what was found and expected; those
+ * not used are no failure.  On failure the network must not be used. */
+#ifndef DAR_MODELS_LOAD_H
+#define DAR_MODELS_LOAD_H
+
+#include "lib/weights.h"
+#include "models/dit.h"
+
+/* Base and adapter; low-rank additions have files of their own (models/lora.h).
+ *
+ * A file without adapter is refused if the network has one: rays would mean nothing to it.  Fewer input channels than
+ * the network's are widened (dar_adapter_bind); residual blocks beyond the file's are made anew, as identity. */
+dar_status dar_load_dit(dar_dit *m, dar_params *p, dar_weights *w, uint64_t seed, dar_err *e);
+
+/* Into the table that dar_vae_init filled. */
+dar_status dar_load_vae(dar_params *p, dar_weights *w, dar_err *e);
+
+/* The name that a parameter has in diffusers: of the transformer, of the autoencoder. */
+void dar_load_diffusers_dit(const char *name, char *out, size_t size);
+void dar_load_diffusers_vae(const char *name, char *out, size_t size);
+
+#endif
