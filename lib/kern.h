@@ -24,8 +24,10 @@
 /* Normalisation of one row: xhat = (x - mean) rstd, y = xhat w + b.  w NULL: 1; b NULL: 0.  The mean is subtracted in
  * two parts, so that rows far from zero keep every bit they have; RMS norm is the same with mean 0.
  *
- * A row is read twice, the second time from the cache; memory would stand idle meanwhile.  So norm and norm_back ask
- * for what will be read next: ahead[0], ahead[1] (NULL: nothing), ahead_size bytes per element of this row. */
+ * A row is read twice, the second time from the cache; memory would stand idle meanwhile.  So norm and norm_sums ask
+ * for ahead[0], norm_back for ahead[1], which will be read next (NULL: nothing): ahead_size bytes per element of this
+ * row.
+ */
 typedef struct dar_norm {
     double mean, rstd;
     const void *w, *b;
@@ -82,7 +84,6 @@ typedef struct dar_kern {
     /* Reductions.  Element i goes to f64 accumulator i mod 32; the 32 are added as a tree: j and j + 16, then 8, 4, 2,
      * 1.  Products of f32 are exact in f64. */
     double (*sum)(size_t n, const void *x);
-    double (*sum_sq)(size_t n, const void *x, double mean); /* of x - mean */
     double (*dot)(size_t n, const void *a, const void *b);
     double (*max)(size_t n, const void *x);          /* ignores NaN; -inf if n = 0 */
     ptrdiff_t (*nonfinite)(size_t n, const void *x); /* index of the first NaN or infinity, or -1 */
@@ -93,11 +94,20 @@ typedef struct dar_kern {
     double (*exp_sum)(size_t n, const void *x, double m, void *y);
     void (*softmax_back)(size_t n, const void *y, const void *gy, double dot, void *gx);
 
-    /* Norms.  norm_sums: sum[0] += Σ w gy, sum[1] += Σ w gy xhat; gw += gy xhat, gb += gy where they are not NULL.
-     * norm_back: gx = rstd (w gy - mean[0] - xhat mean[1]). */
-    void (*norm)(size_t n, const dar_norm *s, const void *x, void *y);
-    void (*norm_sums)(size_t n, const dar_norm *s, const void *x, const void *gy, double sum[2], void *gw, void *gb);
-    void (*norm_back)(size_t n, const dar_norm *s, const void *x, const void *gy, const double mean[2], void *gx);
+    /* Norms, by stored type of x, i8 NULL.
+     *
+     *   moments      m[0] = the mean if `centred`, else 0; m[1] = Σ (x - m[0])^2, as sums of differences from x[0],
+     * which lose at most a factor n, their squares fused with the sum; not centred: of x itself norm         y = xhat w
+     * + b, stored as y_type norm_sums    sum[0] += Σ w gy, sum[1] += Σ w gy xhat; gw += gy xhat, gb += gy where they
+     * are not NULL norm_back    gx = rstd (w gy - mean[0] - xhat mean[1])
+     *
+     * stream, here and below: write past the caches where y or gx is aligned as vectors are. */
+    void (*moments[DAR_DTYPES])(size_t n, const void *x, bool centred, double m[2]);
+    void (*norm[DAR_DTYPES])(size_t n, const dar_norm *s, const void *x, dar_dtype y_type, void *y, bool stream);
+    void (*norm_sums[DAR_DTYPES])(size_t n, const dar_norm *s, const void *x, const void *gy, double sum[2], void *gw,
+                                  void *gb);
+    void (*norm_back[DAR_DTYPES])(size_t n, const dar_norm *s, const void *x, const void *gy, const double mean[2],
+                                  void *gx, bool stream);
 
     /* Norm of the columns of a matrix whose rows lie ld apart, by stored type of x, i8 NULL.
      *
@@ -105,8 +115,7 @@ typedef struct dar_kern {
      *   column_norm    of one row: y[j] = x[j] r[j] w, y stored as x
      *   column_back    of one row: gx[j] = gy[j] r[j] w + x[j] q[j]; returns Σ_j x[j] gy[j] r[j], in the accumulators
      *                  of a reduction but of the table's type
-     *
-     * stream: write past the caches where y or gx is aligned as vectors are. */
+     */
     void (*column_sums[DAR_DTYPES])(size_t rows, size_t n, size_t ld, const void *w, const void *x, const void *z,
                                     void *sum);
     void (*column_norm[DAR_DTYPES])(size_t n, double w, const void *r, const void *x, void *y, bool stream);

@@ -21,7 +21,7 @@ static ulp_tables tables;
 struct rows {
     dar_dtype type;
     void *row[ROWS];
-    double value[3]; /* what a kernel returned */
+    double value[6]; /* what a kernel returned */
     _Alignas(64) unsigned char memory[ROWS][(LONGEST + 2 * EDGE + 4) * sizeof(double)];
 };
 
@@ -74,11 +74,6 @@ typedef void kernel_call(const dar_kern *k, size_t n, struct rows *s);
 
 static const dar_adamw adamw = { 0.01, 0.9, 0.99, 1e-3, 0.1, 2, 4, 0.5 };
 
-static dar_norm norm_of(void **x, bool w, bool b)
-{
-    return (dar_norm){ .mean = 0.3000000001, .rstd = 0.75, .w = w ? x[2] : NULL, .b = b ? x[3] : NULL };
-}
-
 CALL(relu, k->relu(n, x[0], x[1]))
 CALL(relu_back, k->relu_back(n, x[0], x[1], x[2]))
 CALL(rsqrt, k->rsqrt(n, x[4], x[1]))
@@ -90,17 +85,10 @@ CALL(scale, k->scale(n, 0.7, x[0], x[1]))
 CALL(axpy, k->axpy(n, 0.7, x[0], x[1]))
 CALL(mul_add, k->mul_add(n, x[0], x[1], x[2], x[3]))
 CALL(sum, v[0] = k->sum(n, x[0]))
-CALL(sum_sq, v[0] = k->sum_sq(n, x[0], 0.3000000001))
 CALL(dot, v[0] = k->dot(n, x[0], x[1]))
 CALL(max, v[0] = k->max(n, x[0]))
 CALL(nonfinite, v[0] = (double)k->nonfinite(n, x[0]))
 CALL(softmax_back, k->softmax_back(n, x[0], x[1], 0.3, x[2]))
-CALL(norm, dar_norm p = norm_of(x, false, false); k->norm(n, &p, x[0], x[1]))
-CALL(norm_w, dar_norm p = norm_of(x, true, false); k->norm(n, &p, x[0], x[1]))
-CALL(norm_wb, dar_norm p = norm_of(x, true, true); k->norm(n, &p, x[0], x[0]))
-CALL(norm_sums, dar_norm p = norm_of(x, true, false); k->norm_sums(n, &p, x[0], x[1], v, x[3], x[4]))
-CALL(norm_sums_plain, dar_norm p = norm_of(x, false, false); k->norm_sums(n, &p, x[0], x[1], v, NULL, NULL))
-CALL(norm_back, dar_norm p = norm_of(x, true, false); k->norm_back(n, &p, x[0], x[1], (double[]){ 0.1, 0.2 }, x[3]))
 CALL(rope, k->rope(n / 2 * 2, 6, x[0], x[1], x[2], false))
 CALL(rope_long, k->rope(n / 2 * 2, 70, x[0], x[1], x[0], true))
 CALL(adamw, k->adamw(n, &adamw, x[0], x[1], x[4], x[2]))
@@ -156,6 +144,40 @@ static const void *matrix(const dar_kern *k, size_t n, const struct rows *s, dar
     return half;
 }
 
+static void norm_of(const dar_kern *k, size_t n, struct rows *s, dar_dtype t)
+{
+    uint16_t half[LONGEST];
+    const void *x = matrix(k, n, s, t, half), *w = s->row[2];
+    dar_norm p = { .mean = 0.3000000001, .rstd = 0.75 }, weighted = { .mean = 0.3000000001, .rstd = 0.75, .w = w };
+    k->moments[t](n, x, true, s->value);
+    k->norm_sums[t](n, &p, x, s->row[1], s->value + 2, NULL, NULL);
+    k->norm_sums[t](n, &weighted, x, s->row[1], s->value + 4, s->row[3], s->row[4]);
+    k->norm_back[t](n, &weighted, x, s->row[1], (double[]){ 0.1, 0.2 }, s->row[2], false);
+    k->norm_back[t](n, &p, x, s->row[1], (double[]){ 0.1, 0.2 }, s->row[0], true);
+}
+
+static void normed_of(const dar_kern *k, size_t n, struct rows *s, dar_dtype t)
+{
+    uint16_t half[LONGEST];
+    const void *x = matrix(k, n, s, t, half);
+    dar_norm p = { .mean = 0.3000000001, .rstd = 0.75 };
+    k->norm[t](n, &p, x, s->type, s->row[1], false);
+    p.w = s->row[2];
+    k->norm[t](n, &p, x, s->type, s->row[4], true);
+    p.b = s->row[3];
+    k->norm[t](n, &p, x, s->type, s->row[0], true);
+    k->moments[s->type](n, s->row[3], false, s->value);
+}
+
+/* To 16 bits, which are compared as such. */
+static void normed_to(const dar_kern *k, size_t n, struct rows *s, dar_dtype t)
+{
+    _Alignas(64) uint16_t y[LONGEST];
+    dar_norm p = { .mean = 0.3000000001, .rstd = 0.75, .w = s->row[2], .b = s->row[3] };
+    k->norm[s->type](n, &p, s->row[0], t, y, true);
+    k->get[t](n, y, s->row[0]);
+}
+
 static void columns_of(const dar_kern *k, size_t n, struct rows *s, dar_dtype t)
 {
     uint16_t half[LONGEST];
@@ -174,6 +196,14 @@ static void normed_columns_of(const dar_kern *k, size_t n, struct rows *s, dar_d
     if (t != s->type) k->get[t](n, half, s->row[0]);
 }
 
+CALL(norm, norm_of(k, n, s, s->type))
+CALL(norm_bf16, norm_of(k, n, s, DAR_BF16))
+CALL(norm_f16, norm_of(k, n, s, DAR_F16))
+CALL(normed, normed_of(k, n, s, s->type))
+CALL(normed_bf16, normed_of(k, n, s, DAR_BF16))
+CALL(normed_f16, normed_of(k, n, s, DAR_F16))
+CALL(normed_to_bf16, normed_to(k, n, s, DAR_BF16))
+CALL(normed_to_f16, normed_to(k, n, s, DAR_F16))
 CALL(columns, columns_of(k, n, s, s->type))
 CALL(columns_bf16, columns_of(k, n, s, DAR_BF16))
 CALL(columns_f16, columns_of(k, n, s, DAR_F16))
@@ -201,18 +231,17 @@ static const struct {
     EXACT(axpy, 3 * 2),
     EXACT(mul_add, 2 * 2),
     EXACT(sum, 0), /* f64 sums of f32 */
-    EXACT(sum_sq, 3 * 2 * 1.7 * LONGEST),
     EXACT(dot, 0),
     EXACT(max, 0),
     EXACT(max_abs, 0),
     EXACT(nonfinite, 0),
     EXACT(softmax_back, 3 * 2),
-    EXACT(norm, 4 * 1.3),
-    EXACT(norm_w, 5 * 1.3),
-    EXACT(norm_wb, 6 * 2),
-    EXACT(norm_sums, 6 * LONGEST),
-    EXACT(norm_sums_plain, 6 * LONGEST),
-    EXACT(norm_back, 9 * 2),
+    EXACT(norm, 6 * LONGEST), /* sums of f32 in f64 */
+    EXACT(norm_bf16, 6 * LONGEST),
+    EXACT(norm_f16, 6 * LONGEST),
+    EXACT(normed, 6 * 2),
+    EXACT(normed_bf16, 6 * 2),
+    EXACT(normed_f16, 6 * 2),
     EXACT(columns, 38 * LONGEST), /* each of 32 accumulators 31 times, their tree, two products */
     EXACT(columns_bf16, 38 * LONGEST),
     EXACT(columns_f16, 38 * LONGEST),
@@ -231,6 +260,8 @@ static const struct {
 } bytes[] = {
     { "quantise", call_quantise },
     { "quantise_nothing", call_quantise_nothing },
+    { "normed_to_bf16", call_normed_to_bf16 },
+    { "normed_to_f16", call_normed_to_f16 },
     { "normed_columns_bf16", call_normed_columns_bf16 },
     { "normed_columns_f16", call_normed_columns_f16 },
 };

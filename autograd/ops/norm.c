@@ -105,26 +105,10 @@ static void save(const struct walk *w, size_t row, const dar_norm *p)
     if (w->c->aux.data) dar_row_convert(w->type, dar_tensor_at(&w->c->aux, row * STATS), DAR_F64, s, STATS);
 }
 
-/* Elements of the piece of a row that starts at column j. */
-static size_t piece(const struct walk *w, size_t j)
+/* Ask for row i + 1 of x where row i is read. */
+static void ask(dar_norm *p, int which, const dar_tensor *x, size_t d, size_t i)
 {
-    return w->d - j < DAR_PIECE ? w->d - j : DAR_PIECE;
-}
-
-/* The weights of a piece of which p has those of the row. */
-static dar_norm piece_of(const struct walk *w, const dar_norm *p, size_t j)
-{
-    size_t skip = j * dar_dtype_size(w->type);
-    dar_norm q = *p;
-    if (q.w) q.w = (const char *)q.w + skip;
-    if (q.b) q.b = (const char *)q.b + skip;
-    return q;
-}
-
-/* Ask for what row i + 1 of x has where row i has its piece at column j. */
-static void ask(const struct walk *w, dar_norm *p, int which, const dar_tensor *x, size_t i, size_t j)
-{
-    p->ahead[which] = dar_tensor_at(x, (i + 1) * w->d + j);
+    p->ahead[which] = dar_tensor_at(x, (i + 1) * d);
     p->ahead_size[which] = dar_dtype_size(x->dtype);
 }
 
@@ -132,23 +116,17 @@ static void forward_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct walk *w = ctx;
     const dar_tensor *x = &w->c->x[X], *y = &w->c->y;
-    size_t d = w->d, size = dar_dtype_size(w->type);
-    double buf[DAR_PIECE];
+    size_t d = w->d;
+    (void)thread;
 
     for (size_t i = begin; i < end; i++) {
-        dar_norm p = { 0 };
-        const char *from = dar_row_get(w->type, x->dtype, dar_tensor_at(x, i * d), d, own_row(w, thread, 0));
-        if (w->kind->centred) p.mean = w->k->sum(d, from) / (double)d;
-        p.rstd = 1 / sqrt(w->k->sum_sq(d, from, p.mean) / (double)d + w->eps);
+        double m[2];
+        w->k->moments[x->dtype](d, dar_tensor_at(x, i * d), w->kind->centred, m);
+        dar_norm p = { .mean = m[0], .rstd = 1 / sqrt(m[1] / (double)d + w->eps) };
         set_weights(w, dar_group_of(&w->groups, i), &p);
-        for (size_t j = 0, n; j < d; j += n) {
-            dar_norm q = piece_of(w, &p, j);
-            void *to = dar_row_out(w->type, y->dtype, dar_tensor_at(y, i * d + j), w->mode, buf);
-            n = piece(w, j);
-            ask(w, &q, 0, x, i, j);
-            w->k->norm(n, &q, from + j * size, to);
-            dar_row_put(w->type, to, y->dtype, dar_tensor_at(y, i * d + j), n, w->mode);
-        }
+        ask(&p, 0, x, d, i);
+        w->k->norm[x->dtype](d, &p, dar_tensor_at(x, i * d), y->dtype, dar_tensor_at(y, i * d),
+                             w->mode == DAR_PUT_STREAM);
         save(w, i, &p);
     }
 }
@@ -176,25 +154,22 @@ static void backward_row(const struct walk *w, size_t row, size_t group, void *c
 {
     const dar_opctx *c = w->c;
     const dar_tensor *x = &c->x[X], *gy = &c->gy, *gx = &c->gx[X];
-    size_t d = w->d, i = row * d, size = dar_dtype_size(w->type);
-    const char *from = dar_row_get(w->type, x->dtype, dar_tensor_at(x, i), d, own_row(w, thread, 0));
-    const char *g = dar_row_get(w->type, gy->dtype, dar_tensor_at(gy, i), d, own_row(w, thread, 1));
-    double sum[2] = { 0 }, buf[DAR_PIECE];
+    size_t d = w->d, i = row * d;
+    const void *g = dar_row_get(w->type, gy->dtype, dar_tensor_at(gy, i), d, own_row(w, thread, 0));
+    double sum[2] = { 0 };
     dar_norm p = saved(w, row);
 
     set_weights(w, group, &p);
-    w->k->norm_sums(d, &p, from, g, sum, part[0], part[1]);
+    ask(&p, 0, x, d, row);
+    ask(&p, 1, gy, d, row);
+    w->k->norm_sums[x->dtype](d, &p, dar_tensor_at(x, i), g, sum, part[0], part[1]);
     if (!gx->data) return;
     double mean[2] = { w->kind->centred ? sum[0] / (double)d : 0, sum[1] / (double)d };
-    for (size_t j = 0; j < d; j += DAR_PIECE) {
-        size_t n = piece(w, j);
-        dar_norm q = piece_of(w, &p, j);
-        ask(w, &q, 0, x, row, j);
-        ask(w, &q, 1, gy, row, j);
-        void *to = dar_row_out(w->type, gx->dtype, dar_tensor_at(gx, i + j), w->mode, buf);
-        w->k->norm_back(n, &q, from + j * size, g + j * size, mean, to);
-        dar_row_put(w->type, to, gx->dtype, dar_tensor_at(gx, i + j), n, w->mode);
-    }
+    void *dst = dar_tensor_at(gx, i);
+    bool direct = gx->dtype == w->type && w->mode != DAR_PUT_ADD;
+    void *to = direct ? dst : own_row(w, thread, 1);
+    w->k->norm_back[x->dtype](d, &p, dar_tensor_at(x, i), g, mean, to, direct && w->mode == DAR_PUT_STREAM);
+    dar_row_put(w->type, to, gx->dtype, dst, d, w->mode);
 }
 
 static void backward_chunk(void *ctx, size_t i, int thread)
