@@ -100,7 +100,7 @@ $B/test_%: $B/tests/test_%.o $B/libdar.a
 
 $B/test_corpus: $(FUZZ:%=$B/tests/%.o)
 
-$B/test_dit $B/test_adapter $B/test_lora $B/test_scene $B/test_step $B/test_load: $B/tests/model.o
+$B/test_config $B/test_dit $B/test_adapter $B/test_lora $B/test_scene $B/test_step $B/test_load: $B/tests/model.o
 
 test: deps ## install what is missing, build, run every test; the last line counts them
 	@$(MAKE) --no-print-directory test-built
@@ -124,11 +124,12 @@ bench-kernels: deps ## speed of every kernel as a fraction of the machine's peak
 		$B/bench_kernels --output=build/bench/kernels.csv \
 		$(if $(QUICK),--quick) $(if $(FILTER),'--filter=$(FILTER)') $(if $(CPU),--cpu-mask=$(CPU))
 
+$B/speed_dit: $B/tests/bench_peak.o
 $B/speed_%: $B/tests/speed_%.o $B/libdar.a
 	@echo "LD $@"
-	@$(CC) -o $@ $^ $(LDFLAGS) $(LIBS) -lcmocka
+	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
 
-everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/speed_raster $B/ulp
+everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/speed_raster $B/speed_dit $B/ulp
 
 headers: $(HDR:%=alone/%)
 
