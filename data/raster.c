@@ -96,6 +96,7 @@ static void push_inside(struct dar_raster_inside *in, const dar_raster *r, dar_a
     in->nearest = push(a, tiles, DAR_TILE_PIXELS * sizeof *in->nearest);
     in->shown = push(a, tiles, DAR_TILE_PIXELS * sizeof *in->shown);
     in->spent = push(a, tiles, sizeof *in->spent);
+    in->mirrored = push(a, r->scene->instances, sizeof *in->mirrored);
 }
 
 void dar_raster_init(dar_raster *r, const dar_scene *s, const dar_identity *identity, const dar_raster_config *c,
@@ -270,6 +271,7 @@ void dar_raster_draw(dar_raster *r, const dar_pose *p, const dar_view *v, const 
         return;
     }
     in->has_normals = out->normal != NULL;
+    memcpy(in->mirrored, p->mirrored, r->scene->instances * sizeof *in->mirrored);
     dar_pose_vertices(p, r->position, out->normal ? r->normal : NULL, !fresh);
     seconds[DAR_STAGE_POSE] += lap(&mark);
     dar_raster_transform(r, p, moved);
@@ -304,6 +306,18 @@ bool dar_raster_at(const dar_raster *r, int x, int y, uint32_t *instance, uint32
     *instance = p->instance;
     *triangle = p->triangle + (uint32_t)(id % DAR_RASTER_PIECE);
     return true;
+}
+
+bool dar_raster_is_back(const dar_raster *r, uint32_t instance, uint32_t triangle)
+{
+    const dar_scene *s = r->scene;
+    const dar_mesh *m = &s->mesh[s->instance[instance].mesh];
+    size_t corner[3], k = 0;
+    while (m->primitive[k].triangle + m->primitive[k].triangles <= triangle) k++;
+    int material = m->primitive[k].material;
+    if (r->config.faces == DAR_FACES_ALL || material == DAR_NONE || s->material[material].double_sided) return false;
+    dar_raster_corners(r, instance, triangle, corner);
+    return (dar_raster_side(r, corner) > 0) != r->in->mirrored[instance];
 }
 
 double dar_raster_depth(const dar_raster *r, int x, int y)

@@ -129,6 +129,10 @@ typedef struct dar_surface_point {
 /* Of what was drawn last: the triangle that a pixel shows; false: none. */
 bool dar_raster_at(const dar_raster *r, int x, int y, uint32_t *instance, uint32_t *triangle);
 
+/* Of what was drawn last: whether a triangle turns a back to the camera that is not there.  Instances outside the view
+ * are not asked about. */
+bool dar_raster_is_back(const dar_raster *r, uint32_t instance, uint32_t triangle);
+
 /* Of what was drawn last: depth at a pixel, 0: none. */
 double dar_raster_depth(const dar_raster *r, int x, int y);
 

@@ -58,6 +58,7 @@ struct dar_raster_inside {
     double *nearest;         /* [tiles, DAR_TILE_PIXELS] 1 / depth */
     double *shown;           /* [tiles, DAR_TILE_PIXELS] id, exact; f64 so that both are selected by one mask */
     double (*spent)[2];      /* [tiles] seconds of cover and resolve */
+    bool *mirrored;          /* [instances] in the pose drawn last */
     bool drawn, has_normals; /* something; with normals */
 };
 

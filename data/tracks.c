@@ -41,10 +41,11 @@ static bool project(const dar_raster *r, const dar_surface_point *p, double at[3
     return true;
 }
 
-static bool is_visible(const dar_raster *r, const double at[3])
+static bool is_visible(const dar_raster *r, const dar_surface_point *p, const double at[3])
 {
     int width = r->config.width, height = r->config.height;
     if (!(at[0] >= 0 && at[0] < width && at[1] >= 0 && at[1] < height)) return false;
+    if (dar_raster_is_back(r, p->instance, p->triangle)) return false;
     int x0 = (int)floor(at[0] - 0.5), y0 = (int)floor(at[1] - 0.5);
     for (int k = 0; k < 4; k++) {
         int x = x0 + (k & 1), y = y0 + (k >> 1);
@@ -153,7 +154,7 @@ size_t dar_tracks_pick(const dar_raster *r, size_t wanted, bool everywhere, dar_
     if (n && sum_areas(r, shown, sum) > 0)
         for (size_t i = 0; found < wanted && i < wanted * DAR_TRACKS_TRIES; i++) {
             point[found] = candidate(s, first, sum, n, i);
-            if (everywhere || (project(r, &point[found], at) && is_visible(r, at))) found++;
+            if (everywhere || (project(r, &point[found], at) && is_visible(r, &point[found], at))) found++;
         }
     dar_arena_reset(a, m);
     return found;
@@ -199,7 +200,7 @@ static void follow(void *ctx, size_t begin, size_t end, int thread)
         bool before = project(j->r, &j->point[i], at);
         j->xy[2 * row] = (float)at[0];
         j->xy[2 * row + 1] = (float)at[1];
-        j->visible[row] = before && is_visible(j->r, at);
+        j->visible[row] = before && is_visible(j->r, &j->point[i], at);
         if (j->depth) j->depth[i] = (float)at[2];
     }
 }

@@ -27,9 +27,10 @@ void dar_tracks_color(const dar_raster *r, const dar_surface_point *point, size_
 /* Frame `frame` of `frames`, as drawn last.
  *
  *   xy       [n, frames, 2] f32 [px]; (-1, -1) nearer than the near plane
- *   visible  [n, frames] u8: 1 if the point is on the picture and no deeper, by DAR_TRACKS_TOLERANCE, than the deepest
- *            of the pixels whose centres are around it, a pixel without surface being infinitely deep: at outlines a
- *            point stays visible up to one pixel too long
+ *   visible  [n, frames] u8: 1 if the point is on the picture, does not lie on a back that is not there, and is no
+ *            deeper, by DAR_TRACKS_TOLERANCE, than the deepest of the pixels whose centres are around it, a pixel
+ *            without surface being infinitely deep: at outlines of what has two sides a point stays visible up to one
+ *            pixel too long
  *   depth    [n] f32 of this frame, 0 nearer than the near plane; NULL: not wanted */
 void dar_tracks_follow(const dar_raster *r, const dar_surface_point *point, size_t n, size_t frame, size_t frames,
                        float *xy, uint8_t *visible, float *depth);
