@@ -45,7 +45,7 @@ const dar_quality_limit dar_quality_table[DAR_QUALITY_CHECKS] = {
     [DAR_QUALITY_IDENTITY] = { "identity", false, 0, " px",
         "a surface element has not one colour, part and instance at all times",
         "tracking, part or id, and objects in meta.json" },
-    [DAR_QUALITY_TRACKS] = { "tracks", true, 0.9, " of the visible",
+    [DAR_QUALITY_TRACKS] = { "tracks", true, 0.5, " of the visible",
         "tracks do not meet their own colour", "tracks and tracking" },
     [DAR_QUALITY_UNIFORM_RGB] = { "uniform-rgb", true, UNIFORM, "", "a picture is all of one colour", "rgb.h5" },
     [DAR_QUALITY_UNIFORM_TRACKING] = { "uniform-tracking", true, UNIFORM, "", "tracking is all of one colour",

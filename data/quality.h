@@ -28,7 +28,8 @@
  *                world and towards the outside                                                         >= 0.8
  *   identity     pixels whose colour is not in the cell of their part, or whose part is not of their
  *                instance: constant over time, since cells are (data/identity.h)                       <= 0
- *   tracks       share of visible tracks whose colour is there where they are                          >= 0.9
+ *   tracks       share of visible tracks whose colour is there where they are; that of a surface
+ *                seen so flat that no pixel shows it is not                                            >= 0.5
  *   uniform-...  standard deviation over the clip of rgb (the least of all frames), tracking and
  *                normal as in [0, 1], depth and world in sizes of the scene; the largest of channels   >= 0.01
  *

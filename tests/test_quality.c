@@ -308,7 +308,7 @@ static const struct {
     { "normals that are short", short_normals, BIT(NORMAL), 7 },
     { "normals in the camera", camera_normals, BIT(SLOPE), DAR_QUALITY_CLIP },
     { "instances changed places", swap_ids, BIT(IDENTITY), 4 },
-    { "colours changed places", swap_colours, BIT(IDENTITY) | BIT(TRACKS), 4 },
+    { "colours changed places", swap_colours, BIT(IDENTITY), 4 },
     { "tracks of other colours", turn_tracks, BIT(TRACKS), DAR_QUALITY_CLIP },
     { "a black picture", black_frame, BIT(UNIFORM_RGB), 6 },
     { "one colour", one_colour, BIT(UNIFORM_TRACKING), DAR_QUALITY_CLIP },
