@@ -6,6 +6,7 @@
 #include "lib/program.h"
 
 extern const dar_program dar_command_render;
+extern const dar_program dar_command_check;
 extern const dar_program dar_command_show;
 extern const dar_program dar_command_convert;
 

@@ -86,7 +86,7 @@ static int format_of(const char *path)
 static dar_status read_scene_camera(dar_camera_path *p, const char *path, dar_err *e)
 {
     dar_scene scene;
-    dar_clip c = { .scene = &scene, .frames = (size_t)o.frames, .fps = o.fps };
+    dar_clip c = { .scene = &scene, .frames = (size_t)o.frames, .fps = o.fps, .play = DAR_PLAY_ONCE };
     dar_status s = dar_gltf_load(&scene, path, false, e);
     if (s == DAR_OK) s = dar_scene_find_animation(&scene, o.animation, &c.animation, e);
     if (s == DAR_OK && !o.size[0])

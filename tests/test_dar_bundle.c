@@ -1,0 +1,519 @@
+/* test_dar_bundle.c: the program dar-bundle as people and scripts meet it: files in, files out, exit status, one line
+ * for what is wrong. */
+#include "tests/glb.h"
+
+#include <dirent.h>
+#include <fcntl.h>
+#include <ftw.h>
+#include <signal.h>
+#include <spawn.h>
+#include <sys/stat.h>
+#include <sys/wait.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "data/bundle.h"
+#include "data/png.h"
+#include "lib/file.h"
+#include "lib/json.h"
+
+extern char **environ;
+
+#define W      48
+#define H      32
+#define T      5
+#define PIXELS ((size_t)W * H)
+
+static char dir[] = "/tmp/dar-program-XXXXXX", program[PATH_MAX];
+
+/* ---------------------------------------------------------------- running it */
+
+struct ran {
+    int status; /* or 128 + signal */
+    char out[1 << 16], err[1 << 14];
+};
+
+static struct ran ran;
+
+static void read_text(const char *path, char *text, size_t size)
+{
+    FILE *f = fopen(path, "rb");
+    assert_non_null(f);
+    text[fread(text, 1, size - 1, f)] = 0;
+    fclose(f);
+}
+
+/* In the directory of the test; words end with NULL. */
+static pid_t start(const char *const *words)
+{
+    char *argv[32] = { program };
+    posix_spawn_file_actions_t a;
+    pid_t pid;
+    for (int i = 0; words[i]; i++) {
+        assert_true(i < 30);
+        argv[i + 1] = (char *)(uintptr_t)words[i];
+    }
+    posix_spawn_file_actions_init(&a);
+    posix_spawn_file_actions_addopen(&a, 1, "out", O_WRONLY | O_CREAT | O_TRUNC, 0666);
+    posix_spawn_file_actions_addopen(&a, 2, "err", O_WRONLY | O_CREAT | O_TRUNC, 0666);
+    assert_int_equal(posix_spawn(&pid, program, &a, NULL, argv, environ), 0);
+    posix_spawn_file_actions_destroy(&a);
+    return pid;
+}
+
+static int finish(pid_t pid)
+{
+    int how;
+    assert_int_equal(waitpid(pid, &how, 0), pid);
+    read_text("out", ran.out, sizeof ran.out);
+    read_text("err", ran.err, sizeof ran.err);
+    return ran.status = WIFSIGNALED(how) ? 128 + WTERMSIG(how) : WEXITSTATUS(how);
+}
+
+#define RUN(...) finish(start((const char *const[]){ __VA_ARGS__, NULL }))
+
+#define GOOD(...)                                                                                                      \
+    do {                                                                                                               \
+        int good_status = RUN(__VA_ARGS__);                                                                            \
+        CHECK(good_status == 0, "status %d: %s", good_status, ran.err);                                                \
+    } while (0)
+
+static bool one_line(const char *text)
+{
+    const char *end = strchr(text, '\n');
+    return end && !end[1] && end > text;
+}
+
+/* ---------------------------------------------------------------- files */
+
+static int remove_entry(const char *path, const struct stat *st, int type, struct FTW *at)
+{
+    (void)st, (void)type, (void)at;
+    return remove(path);
+}
+
+static bool is_there(const char *path)
+{
+    struct stat st;
+    return lstat(path, &st) == 0;
+}
+
+/* Entries whose names begin with `start`; of a directory. */
+static int count(const char *path, const char *begin)
+{
+    DIR *d = opendir(path);
+    int n = 0;
+    assert_non_null(d);
+    for (const struct dirent *x; (x = readdir(d));)
+        n += strncmp(x->d_name, begin, strlen(begin)) == 0 && strcmp(x->d_name, ".") != 0 &&
+             strcmp(x->d_name, "..") != 0;
+    closedir(d);
+    return n;
+}
+
+static void write_file(const char *path, const void *data, size_t size)
+{
+    FILE *f = fopen(path, "wb");
+    assert_non_null(f);
+    assert_int_equal(fwrite(data, 1, size, f), size);
+    assert_int_equal(fclose(f), 0);
+}
+
+static void same_file(const char *a, const char *b)
+{
+    dar_file_map x, y;
+    dar_err e;
+    CHECK(dar_file_map_open(&x, a, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_file_map_open(&y, b, &e) == DAR_OK, "%s", e.text);
+    CHECK(x.size == y.size && memcmp(x.data, y.data, x.size) == 0, "%s and %s differ", a, b);
+    dar_file_map_close(&x);
+    dar_file_map_close(&y);
+}
+
+static void same_bundle(const char *a, const char *b)
+{
+    DIR *d = opendir(a);
+    char x[512], y[512];
+    assert_non_null(d);
+    assert_int_equal(count(a, ""), count(b, ""));
+    for (const struct dirent *f; (f = readdir(d));) {
+        if (f->d_name[0] == '.') continue;
+        snprintf(x, sizeof x, "%s/%s", a, f->d_name);
+        snprintf(y, sizeof y, "%s/%s", b, f->d_name);
+        same_file(x, y);
+    }
+    closedir(d);
+}
+
+/* A number in the JSON that was printed. */
+static double printed(const char *object, const char *key)
+{
+    dar_json_doc *doc;
+    dar_err e;
+    CHECK(dar_json_parse(&doc, "standard output", ran.out, strlen(ran.out), &e) == DAR_OK, "%s", e.text);
+    dar_json j = dar_json_root(doc);
+    if (object) j = dar_json_object(j, object);
+    double x = dar_json_number(j, key, NAN, -1e300, 1e300);
+    dar_json_close(doc);
+    return x;
+}
+
+/* ---------------------------------------------------------------- a scene */
+
+static glb g;
+
+/* A cube of side 2 that stands, a smaller one that goes round it, a camera 4 in front of the centre, with a field of
+ * view whose tangent is 1/2. */
+static void write_scene(const char *path, bool broken)
+{
+    static const float corner[8][3] = { { -1, -1, -1 }, { 1, -1, -1 }, { 1, 1, -1 }, { -1, 1, -1 },
+                                        { -1, -1, 1 },  { 1, -1, 1 },  { 1, 1, 1 },  { -1, 1, 1 } };
+    static const uint16_t face[36] = { 0, 2, 1, 0, 3, 2, 4, 5, 6, 4, 6, 7, 0, 1, 5, 0, 5, 4,
+                                       2, 3, 7, 2, 7, 6, 0, 4, 7, 0, 7, 3, 1, 2, 6, 1, 6, 5 };
+    float time[3] = { 0, 0.5f, 1 }, turn[3][4] = { { 0, 0, 0, 1 }, { 0, 1, 0, 0 }, { 0, 0, 0, -1 } };
+    if (broken) memset(turn[1], 0xff, sizeof turn[1]); /* NaN */
+    memset(&g, 0, sizeof g);
+    int p = GLB_F32(&g, 3, corner), i = GLB_U16(&g, 1, face), t = GLB_F32(&g, 1, time), q = GLB_F32(&g, 4, turn);
+    GLB_REST(&g, "\"meshes\":[{\"primitives\":[{\"indices\":%d,\"attributes\":{\"POSITION\":%d}}]}],", i, p);
+    GLB_REST(&g, "\"cameras\":[{\"type\":\"perspective\",\"perspective\":{\"yfov\":%.17g,\"znear\":0.1}}],",
+             2 * atan(0.5));
+    GLB_REST(&g, "\"nodes\":[{\"mesh\":0,\"name\":\"body\"},{\"children\":[2],\"name\":\"pivot\"},"
+                 "{\"mesh\":0,\"name\":\"moon\",\"translation\":[2,0,0],\"scale\":[0.25,0.25,0.25]},"
+                 "{\"camera\":0,\"name\":\"eye\",\"translation\":[0,0,4]}],");
+    GLB_REST(&g,
+             "\"animations\":[{\"name\":\"turn\",\"channels\":[{\"sampler\":0,\"target\":{\"node\":1,\"path\":"
+             "\"rotation\"}}],\"samplers\":[{\"input\":%d,\"output\":%d}]}]",
+             t, q);
+    glb_finish(&g);
+    write_file(path, g.out, g.size);
+}
+
+#define SCENE "scene.glb", "--size", "48x32", "--frames", "5", "--fps", "4"
+
+/* ---------------------------------------------------------------- from a scene to a sheet */
+
+static dar_bundle *opened(const char *path)
+{
+    dar_bundle *b;
+    dar_err e;
+    dar_status s = dar_bundle_open(&b, path, &e);
+    CHECK(s == DAR_OK, "%s", e.text);
+    return b;
+}
+
+static void from_scene_to_sheet(void **state)
+{
+    (void)state;
+    float depth[PIXELS];
+    dar_err e;
+    dar_file_map m;
+    dar_image im;
+    GOOD("render", SCENE, "-o", "eye", "--camera-name", "eye", "--prompt", "two cubes", "--json");
+    CHECK_NEAR("frames", printed(NULL, "frames"), T, 0);
+    CHECK(printed("seconds", "draw") > 0 && printed("skipped", "triangles") == T * 24, "%s", ran.out);
+    dar_bundle *b = opened("eye");
+    assert_true(b->meta.frames == T && b->meta.width == W && b->meta.height == H);
+    assert_string_equal(b->meta.source, "scene.glb");
+    assert_string_equal(b->meta.animation, "turn");
+    assert_string_equal(b->meta.prompt, "two cubes");
+    assert_int_equal(b->families, (1 << DAR_BUNDLE_FAMILIES) - 1);
+    assert_int_equal(b->tracks, 2048);
+    assert_int_equal(b->meta.objects, 2);
+    assert_string_equal(b->meta.object[1].name, "moon");
+    CHECK_NEAR("focal length", b->cameras.view[0].fy, H, 1e-9);
+    assert_int_equal(dar_bundle_values(b, DAR_FAMILY_DEPTH, 0, depth, &e), DAR_OK);
+    CHECK_NEAR("the cube's front", depth[(H / 2) * W + W / 2], 3, 1e-6);
+    CHECK_NEAR("the moon, to the right", depth[(H / 2) * W + W / 2 + 16], 3.75, 1e-6);
+    assert_int_equal(dar_bundle_values(b, DAR_FAMILY_DEPTH, 2, depth, &e), DAR_OK); /* half way: to the left */
+    CHECK_NEAR("nothing to the right", depth[(H / 2) * W + W / 2 + 16], 0, 0);
+    CHECK_NEAR("the moon, to the left", depth[(H / 2) * W + W / 2 - 17], 3.75, 1e-6);
+    dar_bundle_close(b);
+
+    GOOD("show", "eye", "-o", "sheet.png", "--columns", "3", "--width", "40", "--json");
+    assert_int_equal(dar_file_map_open(&m, "sheet.png", &e), DAR_OK);
+    assert_int_equal(dar_image_probe(&im, "sheet.png", m.data, m.size, &e), DAR_OK);
+    dar_file_map_close(&m);
+    CHECK(printed(NULL, "width") == (double)im.width && printed(NULL, "height") == (double)im.height &&
+              printed(NULL, "rows") == DAR_BUNDLE_FAMILIES + 2,
+          "%zu x %zu: %s", im.width, im.height, ran.out);
+
+    GOOD("render", "--list-trajectories");
+    assert_non_null(strstr(ran.out, "\norbit-60 "));
+    GOOD("render", SCENE, "-o", "few", "--trajectory", "full-orbit", "--seed", "7", "--families", "world+id");
+    b = opened("few");
+    assert_int_equal(b->families, 1 << DAR_FAMILY_WORLD | 1 << DAR_BUNDLE_ID | 1 << DAR_FAMILY_MASK);
+    assert_string_equal(b->meta.trajectory, "full-orbit");
+    assert_int_equal(b->meta.seed, 7);
+    dar_bundle_close(b);
+}
+
+static void checked(void **state)
+{
+    (void)state;
+    GOOD("render", "scene.glb", "--size", "160x96", "--frames", "5", "--fps", "4", "-o", "sound", "--trajectory",
+         "orbit-30");
+    GOOD("check", "sound", "--json");
+    CHECK_NEAR("good", printed(NULL, "good"), 1, 0);
+    GOOD("check", "sound", "--all", "--record");
+    assert_non_null(strstr(ran.out, "position: good"));
+
+    /* Another file than the one that was written: the check says no; a bundle that is none is bad input. */
+    GOOD("render", SCENE, "-o", "odd");
+    write_file("odd/cameras.txt", "nonsense\n", 9);
+    assert_int_equal(RUN("check", "sound", "odd"), 1);
+    assert_non_null(strstr(ran.out, "sound: good"));
+    assert_non_null(strstr(ran.out, "odd: bad"));
+    assert_non_null(strstr(ran.out, "files: bad"));
+    assert_int_equal(RUN("check", "nowhere", "sound"), 2);
+    assert_non_null(strstr(ran.out, "sound: good"));
+    write_file("odd/meta.json", "{", 1);
+    assert_int_equal(RUN("check", "odd"), 2);
+}
+
+/* ---------------------------------------------------------------- same bits */
+
+static void any_threads(void **state)
+{
+    (void)state;
+    static const char *const name[] = { "one", "two", "three" }, *const threads[] = { "1", "2", "3" };
+    for (int i = 0; i < 3; i++) {
+        GOOD("render", "scene.glb", "--size", "200x150", "--frames", "5", "--fps", "4", "--seed", "3", "--trajectory",
+             "rolling-orbit", "--threads", threads[i], "-o", name[i]);
+        if (i) same_bundle("one", name[i]);
+    }
+    assert_int_equal(RUN("render", SCENE, "-o", "two"), 2); /* it is there */
+    same_bundle("one", "two");
+    GOOD("render", SCENE, "-o", "two", "--overwrite");
+    dar_bundle *b = opened("two");
+    assert_int_equal(b->meta.width, W);
+    dar_bundle_close(b);
+}
+
+/* ---------------------------------------------------------------- what a person brings */
+
+static void fill_picture(uint8_t *rgb, size_t frame)
+{
+    for (size_t i = 0; i < 3 * PIXELS; i++) rgb[i] = (uint8_t)(i * 7 + frame * 31);
+}
+
+static void pictures(void **state)
+{
+    (void)state;
+    static uint8_t rgb[3 * PIXELS], found[3 * PIXELS];
+    char name[64];
+    dar_err e;
+    assert_int_equal(mkdir("frames", 0777), 0);
+    for (size_t t = 0; t < T; t++) {
+        fill_picture(rgb, t);
+        snprintf(name, sizeof name, "frames/%zu.png", 8 + t); /* 9 is before 10 */
+        assert_int_equal(dar_png_write(name, W, H, 3, rgb, &e), DAR_OK);
+    }
+    GOOD("render", SCENE, "-o", "seen", "--rgb", "frames");
+    dar_bundle *b = opened("seen");
+    assert_true(b->rgb && b->reference);
+    for (size_t t = 0; t < T; t++) {
+        fill_picture(rgb, t);
+        assert_int_equal(dar_bundle_rgb(b, t, found, &e), DAR_OK);
+        assert_memory_equal(found, rgb, sizeof rgb);
+    }
+    dar_bundle_close(b);
+    GOOD("show", "seen", "-o", "seen.png", "--width", "32");
+
+    GOOD("render", SCENE, "-o", "referred", "--reference", "frames/9.png");
+    b = opened("referred");
+    assert_true(!b->rgb && b->reference);
+    fill_picture(rgb, 1);
+    assert_int_equal(dar_bundle_reference(b, found, &e), DAR_OK);
+    assert_memory_equal(found, rgb, sizeof rgb);
+    dar_bundle_close(b);
+}
+
+/* A camera that stands before a scene at rest: one frame is drawn, the others are copies. */
+static void still(void **state)
+{
+    (void)state;
+    FILE *f = fopen("still.txt", "w");
+    assert_non_null(f);
+    fprintf(f, "url\n");
+    for (int t = 0; t < T; t++) fprintf(f, "%d 1 1 0.5 0.5 0 0 1 0 0 0 0 -1 0 0 0 0 -1 5\n", t);
+    assert_int_equal(fclose(f), 0);
+    GOOD("render", "scene.glb", "--size", "48x32", "--camera", "still.txt", "--pose-size", "0x0", "--animation", "rest",
+         "-o", "still", "--json");
+    CHECK_NEAR("frames of the camera file", printed(NULL, "frames"), T, 0);
+    CHECK_NEAR("copied", printed("skipped", "frames_copied"), T - 1, 0);
+    dar_bundle *b = opened("still");
+    float first[PIXELS], last[PIXELS];
+    dar_err e;
+    assert_int_equal(dar_bundle_values(b, DAR_FAMILY_DEPTH, 0, first, &e), DAR_OK);
+    assert_int_equal(dar_bundle_values(b, DAR_FAMILY_DEPTH, T - 1, last, &e), DAR_OK);
+    CHECK_NEAR("the cube's front", last[(H / 2) * W + W / 2], 4, 1e-6);
+    assert_memory_equal(first, last, sizeof first);
+    dar_bundle_close(b);
+}
+
+/* ---------------------------------------------------------------- conversions */
+
+static void conversions(void **state)
+{
+    (void)state;
+    static const char *const way[] = { "way.txt", "transforms.json", "way.gltf", "way.json" };
+    dar_camera_options o = dar_camera_io_standard();
+    dar_camera_path x, y;
+    dar_err e;
+    GOOD("render", SCENE, "-o", "round", "--trajectory", "half-orbit");
+    const char *from = "round";
+    for (size_t i = 0; i < DAR_COUNT(way); from = way[i++])
+        GOOD("convert", from, "-o", way[i], "--size", "48x32", "--fps", "4");
+    assert_int_equal(dar_camera_io_read(&x, "round/cameras.json", DAR_CAMERA_JSON, &o, &e), DAR_OK);
+    assert_int_equal(dar_camera_io_read(&y, "way.json", DAR_CAMERA_JSON, &o, &e), DAR_OK);
+    assert_int_equal(y.frames, T);
+    for (size_t t = 0; t < T; t++) {
+        CHECK_NEAR("focal length", y.view[t].fx, x.view[t].fx, 1e-4); /* glTF holds f32 */
+        for (int k = 0; k < 12; k++) CHECK_NEAR("pose", y.view[t].c2w[k], x.view[t].c2w[k], 1e-5);
+    }
+    dar_camera_free(&x);
+    dar_camera_free(&y);
+
+    /* To EXR and back: the same numbers. */
+    static float a[3 * PIXELS], b[3 * PIXELS];
+    GOOD("convert", "round", "-o", "round-exr");
+    assert_int_equal(count("round-exr", "0000"), T);
+    GOOD("convert", "round-exr", "-o", "again", "--camera", "round/cameras.json", "--fps", "4");
+    dar_bundle *p = opened("round"), *q = opened("again");
+    assert_int_equal(q->families, p->families & ~(1u << DAR_FAMILY_SPARSE));
+    for (size_t t = 0; t < T; t++)
+        for (int f = 0; f < DAR_FAMILY_SPARSE; f++) {
+            memset(a, 0, sizeof a), memset(b, 0, sizeof b);
+            assert_int_equal(dar_bundle_values(p, (dar_family)f, t, a, &e), DAR_OK);
+            assert_int_equal(dar_bundle_values(q, (dar_family)f, t, b, &e), DAR_OK);
+            /* Positions are stored in 16 bits of other bounds: half a step each. */
+            double bound = f == DAR_FAMILY_WORLD    ? q->meta.world.size / 131070 * 1.001
+                           : f == DAR_FAMILY_NORMAL ? 1e-4
+                                                    : 0;
+            for (size_t i = 0; i < 3 * PIXELS; i++) CHECK_NEAR(dar_family_table[f].name, b[i], a[i], bound);
+        }
+    dar_bundle_close(p);
+    dar_bundle_close(q);
+}
+
+/* ---------------------------------------------------------------- what does not work */
+
+static void refusals(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *words[12];
+        const char *says;
+    } bad[] = {
+        { { "rendre" }, "did you mean render?" },
+        { { "render", "-o", "no" }, "expected SCENE" },
+        { { "render", "scene.glb" }, "expected -o BUNDLE" },
+        { { "render", "nowhere.glb", "-o", "no" }, "nowhere.glb: No such file" },
+        { { "render", "short.glb", "-o", "no" }, "short.glb: " },
+        { { "render", "nan.glb", "-o", "no" }, "nan.glb: " },
+        { { "render", "junk.glb", "-o", "no" }, "junk.glb: " },
+        { { "render", "scene.glb", "-o", "no", "--size", "99999x1" }, "--size: found '99999x1'" },
+        { { "render", "scene.glb", "-o", "no", "--trajectory", "orbit" }, "expected one of 34 names" },
+        { { "render", "scene.glb", "-o", "no", "--animation", "jump" }, "no animation 'jump'" },
+        { { "render", "scene.glb", "-o", "no", "--camera-name", "ear" }, "found no camera 'ear'; there are 1: eye" },
+        { { "render", "scene.glb", "-o", "no", "--camera", "junk.glb" }, "junk.glb" },
+        { { "render", "scene.glb", "-o", "no", "--camera", "x", "--trajectory", "y" }, "expected one of --camera" },
+        { { "render", "scene.glb", "-o", "no", "--families", "wrold" }, "found 'wrold'" },
+        { { "render", "scene.glb", "-o", "no", "--rgb", "." }, "PNG and JPEG files, expected 81" },
+        { { "render", "scene.glb", "-o", "no", "--reference", "junk.glb" }, "junk.glb: neither a PNG nor a JPEG" },
+        { { "render", "scene.glb", "-o", "no", "--track-side", "2" }, "found 2, expected an odd number" },
+        { { "render", "scene.glb", "-o", "nowhere/no" }, "nowhere/no" },
+        { { "render", "scene.glb", "-o", "scene.glb" }, "scene.glb: is there already" },
+        { { "show", "scene.glb", "-o", "no" }, "scene.glb" },
+        { { "show", ".", "-o", "no" }, "meta.json" },
+        { { "check" }, "expected BUNDLE" },
+        { { "check", "." }, "meta.json" },
+        { { "convert", ".", "-o", "no" }, "found neither meta.json, of a bundle, nor EXR files" },
+        { { "convert", "junk.glb", "-o", "no.json" }, "junk.glb: " },
+        { { "convert", "scene.glb", "-o", "no.json" }, "expected --size" },
+    };
+    write_scene("nan.glb", true);
+    write_scene("scene.glb", false);
+    write_file("short.glb", g.out, g.size / 2);
+    write_file("junk.glb", "glTF what is this", 17);
+    for (size_t i = 0; i < DAR_COUNT(bad); i++) {
+        int status = finish(start(bad[i].words));
+        CHECK(status == 2, "%s %s: status %d: %s", bad[i].words[0], bad[i].says, status, ran.err);
+        CHECK(one_line(ran.err) && !*ran.out, "%s: more or less than a line: %s%s", bad[i].says, ran.err, ran.out);
+        CHECK(strstr(ran.err, bad[i].says), "found:    %sexpected: %s", ran.err, bad[i].says);
+        CHECK(count(".", "no") == 0, "%s: something is left", bad[i].says);
+    }
+    GOOD("render", SCENE, "-o", "no", "--dry-run");
+    CHECK(strstr(ran.out, "5 frames of 48 x 32, about") && count(".", "no") == 0, "%s", ran.out);
+}
+
+/* ---------------------------------------------------------------- stopped half way */
+
+/* Start a render that would take a minute, and wait until it writes frames. */
+static pid_t start_long(void)
+{
+    pid_t pid = start((const char *const[]){ "render", "scene.glb", "--size", "320x200", "--frames", "20001", "-o",
+                                             "long", "--trajectory", "full-orbit", NULL });
+    for (int i = 0; i < 2000 && count(".", "long") == 0; i++) nanosleep(&(struct timespec){ .tv_nsec = 5000000 }, NULL);
+    nanosleep(&(struct timespec){ .tv_nsec = 100000000 }, NULL);
+    CHECK(waitpid(pid, NULL, WNOHANG) == 0 && count(".", "long.tmp") == 1 && !is_there("long"), "it does not run");
+    return pid;
+}
+
+static void killed(void **state)
+{
+    (void)state;
+    pid_t pid = start_long();
+    kill(pid, SIGKILL);
+    assert_int_equal(finish(pid), 128 + SIGKILL);
+    CHECK(!is_there("long") && count(".", "long") == 1, "a bundle, or nothing, is left");
+    GOOD("render", SCENE, "-o", "long");
+    CHECK(is_there("long/meta.json") && count(".", "long") == 1, "leftovers");
+}
+
+static void interrupted(void **state)
+{
+    (void)state;
+    nftw("long", remove_entry, 8, FTW_DEPTH | FTW_PHYS);
+    pid_t pid = start_long();
+    kill(pid, SIGINT);
+    assert_int_equal(finish(pid), 130);
+    CHECK(count(".", "long") == 0, "something is left");
+    CHECK(one_line(ran.err) && strstr(ran.err, "interrupted after "), "%s", ran.err);
+}
+
+/* ---------------------------------------------------------------- */
+
+static int in_directory(void **state)
+{
+    (void)state;
+    if (!mkdtemp(dir) || chdir(dir) != 0) return -1;
+    write_scene("scene.glb", false);
+    return 0;
+}
+
+static int remove_directory(void **state)
+{
+    (void)state;
+    return chdir("/") != 0 || nftw(dir, remove_entry, 8, FTW_DEPTH | FTW_PHYS) != 0;
+}
+
+int main(int argc, char **argv)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(from_scene_to_sheet),
+        cmocka_unit_test(checked),
+        cmocka_unit_test(any_threads),
+        cmocka_unit_test(pictures),
+        cmocka_unit_test(still),
+        cmocka_unit_test(conversions),
+        cmocka_unit_test(refusals),
+        cmocka_unit_test(killed),
+        cmocka_unit_test(interrupted),
+    };
+    char own[PATH_MAX];
+    if (argc < 1 || !realpath(argv[0], own)) return 2;
+    *strrchr(own, '/') = 0;
+    if (snprintf(program, sizeof program, "%s/dar-bundle", own) >= (int)sizeof program) return 2;
+    return cmocka_run_group_tests(tests, in_directory, remove_directory) != 0;
+}
