@@ -12,16 +12,17 @@
 #include "lib/thread.h"
 #include "lib/tile.h"
 
-#define PIXELS  256                 /* of a run, at most; */
-#define C_BYTES ((size_t)512 << 10) /* more where few channels leave room for them, */
-#define AROUND  2                   /* up to so many times what is read around them */
-#define B_BYTES ((size_t)448 << 10)
-#define STEPS   1024 /* of one tile call */
-#define ROWS    512  /* of w per task */
-#define TASKS   16   /* wanted at least, */
-#define LITTLE  96   /* but none with fewer rows: they pay for packing pixels */
-#define FILL    16   /* channels filled in before they are packed: first-level cache */
-#define TURN    48   /* rows of turned w written together */
+#define PIXELS     256                 /* of a run, at most; */
+#define C_BYTES    ((size_t)512 << 10) /* more where few channels leave room for them, */
+#define AROUND     2                   /* up to so many times what is read around them */
+#define B_BYTES    ((size_t)448 << 10)
+#define STEPS      1024 /* of one tile call */
+#define ROWS       512  /* of w per task */
+#define TASKS      16   /* wanted at least, */
+#define LITTLE     96   /* but none with fewer rows: they pay for packing pixels */
+#define FILL       16   /* channels filled in before they are packed: first-level cache */
+#define TURN       48   /* rows of turned w written together, */
+#define TURN_DEPTH 128  /* from so many channels: second-level cache */
 
 struct job {
     const dar_conv_slide *s;
@@ -113,35 +114,21 @@ size_t dar_conv_slide_scratch(const dar_conv_slide *s, int threads)
 
 /* ---------------------------------------------------------------- w */
 
-/* The taps of channel c in row r. */
-static const char *taps_of(const struct job *j, size_t r, size_t c)
-{
-    size_t at = j->s->turned ? c * j->c->Cout + r : r * j->c->Cin + c;
-    return (const char *)j->s->w->data + at * j->taps * dar_dtype_size(j->s->w->dtype);
-}
-
-/* Rows [begin, end): for each unit of channels its taps. */
+/* Rows [begin, end): for each unit of channels its taps, which is how a tile wants columns. */
 static void pack_weights(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct job *j = ctx;
-    size_t unit = j->tile->unit, bytes = j->tile->unit_bytes;
+    const dar_tensor *w = j->s->w;
+    size_t Cin = j->c->Cin, Cout = j->c->Cout, unit = j->tile->unit, block = j->s->turned ? TURN_DEPTH : Cin;
+    size_t ld = (j->s->turned ? Cout : 1) * j->taps;
     (void)thread;
 
-    for (size_t u = 0; u < j->units; u++)
+    for (size_t c = 0; c < Cin; c += block)
         for (size_t r = begin; r < end; r++) {
-            char *to = j->a + (r * j->row + u * j->taps) * bytes;
-            const char *low = taps_of(j, r, u * unit);
-            if (unit == 1) {
-                dar_row_convert(j->operand, to, j->s->w->dtype, low, j->taps);
-                continue;
-            }
-            const uint16_t *p = (const void *)low, *q = NULL;
-            uint16_t *pair = (void *)to;
-            if (u * unit + 1 < j->c->Cin) q = (const void *)taps_of(j, r, u * unit + 1);
-            for (size_t i = 0; i < j->taps; i++) {
-                pair[2 * i] = p[i];
-                pair[2 * i + 1] = q ? q[i] : 0;
-            }
+            size_t at = j->s->turned ? c * Cout + r : r * Cin + c;
+            dar_tile_pack_b_wide(j->tile, w->dtype, (char *)w->data + at * j->taps * dar_dtype_size(w->dtype), ld,
+                                 dar_least(block, Cin - c), j->taps, j->taps,
+                                 j->a + (r * j->row + c / unit * j->taps) * j->tile->unit_bytes);
         }
 }
 
@@ -185,9 +172,10 @@ static void pack_frame(const struct job *j, size_t batch, int64_t t, size_t u, s
     for (size_t i = 0; i < channels; i += FILL) {
         size_t k = dar_least(FILL, channels - i), size = dar_dtype_size(type);
         char *rows = as_is ? b + i * j->ld * size : buf;
-        for (size_t c = 0; c < k; c++)
-            fill(j, type, rows + c * j->ld * size, type, dar_clip_frame(&j->s->in, batch, c0 + i + c, t, &type), at,
-                 j->ld);
+        for (size_t c = 0; c < k; c++) {
+            const char *frame = dar_clip_frame(&j->s->in, batch, c0 + i + c, t, &type);
+            fill(j, type, rows + c * j->ld * size, type, frame, at, j->ld);
+        }
         if (!as_is)
             dar_tile_pack_b_wide(tile, type, buf, j->ld, k, j->ld, j->ld,
                                  b + i / tile->unit * j->ld * tile->unit_bytes);
@@ -199,20 +187,41 @@ static void pack_frame(const struct job *j, size_t batch, int64_t t, size_t u, s
 /* Rows r0.. of w, pixels q0.. of an output frame. */
 struct task {
     size_t batch, t, r0, m, q0, n;
+    int64_t first; /* place of the first pixel that it reads, in frames */
     char *b, *c, *buf;
 };
 
+/* Ask for what a run reads of one frame and channel, counted from the first of unit u: memory would stand idle during
+ * the product, and wait for every new channel afterwards. */
+static void ahead(const struct job *j, const struct task *w, size_t u, size_t piece)
+{
+    const dar_conv *c = j->c;
+    size_t channel = u * j->tile->unit + piece / c->kt, row = w->first < 0 ? 0 : (size_t)w->first / j->pitch;
+    dar_dtype type;
+
+    if (channel >= c->Cin || row >= c->H) return;
+    const char *frame = dar_clip_frame(&j->s->in, w->batch, channel, (int64_t)(w->t + piece % c->kt) - c->front, &type);
+    if (!frame) return;
+    size_t size = dar_dtype_size(type) * c->W, rows = dar_least(dar_blocks(j->ld, j->pitch), c->H - row);
+    for (size_t i = 0; i < rows * size; i += DAR_ALIGN) __builtin_prefetch(frame + row * size + i, 0, 2);
+}
+
+/* c (+)= the block of `units` at u.  Meanwhile the next one is asked for. */
 static void multiply(const struct job *j, const struct task *w, size_t u, size_t units)
 {
     const dar_tile *t = j->tile;
     size_t size = dar_dtype_size(j->sum), bytes = t->unit_bytes;
+    size_t calls = dar_blocks(w->m, t->mr) * dar_blocks(w->n, t->nr), call = 0, next = u + units, piece = 0;
+    size_t pieces = next < j->units ? dar_least(j->depth, j->units - next) * t->unit * j->c->kt : 0;
     const char *a = (j->packs_a ? j->a : (char *)j->s->w->data) + (w->r0 * j->row + u * j->taps) * bytes;
 
     for (size_t i = 0; i < w->m; i += t->mr)
-        for (size_t q = 0; q < w->n; q += t->nr)
+        for (size_t q = 0; q < w->n; q += t->nr) {
+            for (call++; piece * calls < call * pieces; piece++) ahead(j, w, next, piece);
             t->mm_taps(units, j->taps, j->at, a + i * j->row * bytes, j->row, w->b + q * bytes, j->ld,
                        w->c + (i * j->n + q) * size, j->n, dar_least(t->mr, w->m - i), dar_least(t->nr, w->n - q),
                        u ? DAR_PUT_ADD : DAR_PUT);
+        }
 }
 
 /* out = c + b, without what lies between the rows. */
@@ -246,8 +255,8 @@ static void task(void *ctx, size_t i, int thread)
     const dar_conv *c = j->c;
     struct task w = { .r0 = i % j->down * j->m, .q0 = i / j->down % j->runs * j->n };
     size_t frame = i / j->down / j->runs, bytes = j->tile->unit_bytes;
-    int64_t at = (int64_t)w.q0 - c->left - c->top * (int64_t)j->pitch;
 
+    w.first = (int64_t)w.q0 - c->left - c->top * (int64_t)j->pitch;
     w.t = frame % c->To;
     w.batch = frame / c->To;
     w.m = dar_least(j->m, c->Cout - w.r0);
@@ -258,8 +267,8 @@ static void task(void *ctx, size_t i, int thread)
     for (size_t u = 0; u == 0 || u < j->units; u += j->depth) { /* of no channels: zeros */
         size_t units = dar_least(j->depth, j->units - u);
         for (size_t kt = 0; kt < c->kt; kt++)
-            pack_frame(j, w.batch, (int64_t)(w.t + kt) - c->front, u, units, at, w.b + kt * j->depth * j->ld * bytes,
-                       w.buf);
+            pack_frame(j, w.batch, (int64_t)(w.t + kt) - c->front, u, units, w.first,
+                       w.b + kt * j->depth * j->ld * bytes, w.buf);
         multiply(j, &w, u, units);
     }
     store(j, &w);
