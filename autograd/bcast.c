@@ -3,6 +3,7 @@
 
 #include <string.h>
 
+#include "lib/size.h"
 #include "lib/thread.h"
 
 #define TASK 16384 /* elements per task, about */
@@ -69,11 +70,6 @@ static size_t piece_length(const struct walk *w, size_t piece)
     return left < DAR_PIECE ? left : DAR_PIECE;
 }
 
-static size_t min(size_t a, size_t b)
-{
-    return a < b ? a : b;
-}
-
 static void *at(const dar_tensor *x, size_t element)
 {
     return (char *)x->data + element * dar_dtype_size(x->dtype);
@@ -126,7 +122,7 @@ void dar_bcast_map(const dar_bcast *b)
 {
     struct map m = { b, walk_over(&b->y->shape, b), dar_put_for(dar_tensor_bytes(b->y), b->add) };
     size_t count = dar_tensor_count(b->y), length = m.w.d[m.w.n - 1];
-    if (count) dar_parallel_range(count / length * m.w.pieces, TASK / min(length, DAR_PIECE), map_pieces, &m);
+    if (count) dar_parallel_range(count / length * m.w.pieces, TASK / dar_least(length, DAR_PIECE), map_pieces, &m);
 }
 
 /* ---------------------------------------------------------------- sum */
@@ -152,7 +148,7 @@ static struct sum plan_sum(const dar_bcast *b)
 {
     struct sum s = { .b = b, .w = walk_over(&b->x[0]->shape, b), .units = 1, .terms = 1, .chunks = 1, .group = 1 };
     int last = s.w.n - 1;
-    size_t piece = min(s.w.d[last], DAR_PIECE);
+    size_t piece = dar_least(s.w.d[last], DAR_PIECE);
 
     s.count = dar_shape_count(&b->y->shape);
     s.inner = !s.w.step[0][last];
@@ -161,11 +157,11 @@ static struct sum plan_sum(const dar_bcast *b)
     if (!piece || !s.units || !s.terms) return s;
 
     size_t least = s.inner || TASK / piece > BLOCK ? TASK / piece : BLOCK; /* terms that are worth a task */
-    if (s.units < MOST_PARTS) s.chunks = min((s.terms + least - 1) / least, MOST_PARTS / s.units);
+    if (s.units < MOST_PARTS) s.chunks = dar_least((s.terms + least - 1) / least, MOST_PARTS / s.units);
     s.chunk = (s.terms + s.chunks - 1) / s.chunks;
     s.chunks = (s.terms + s.chunk - 1) / s.chunk;
-    if (!s.inner) s.group = min(s.units * s.chunks / LEAST_TASKS + 1, BESIDE);
-    else if (s.chunks == 1) s.group = min(least / s.terms + 1, DAR_PIECE);
+    if (!s.inner) s.group = dar_least(s.units * s.chunks / LEAST_TASKS + 1, BESIDE);
+    else if (s.chunks == 1) s.group = dar_least(least / s.terms + 1, DAR_PIECE);
     return s;
 }
 
@@ -224,7 +220,7 @@ static void sum_outer(const struct sum *s, size_t unit, size_t units, size_t beg
     dar_dtype c = dar_compute_type(s->b->x[0]->dtype);
     const dar_kern *k = dar_kern_for(c);
     double buf[1 + DAR_BCAST_IN][DAR_PIECE], row[BESIDE][DAR_PIECE];
-    size_t width = min(s->w.d[s->w.n - 1], DAR_PIECE);
+    size_t width = dar_least(s->w.d[s->w.n - 1], DAR_PIECE);
 
     for (size_t u = 0; u < units; u++) memset(row[u], 0, width * sizeof **row), memset(acc[u], 0, width * sizeof **acc);
     for (size_t i = begin; i < end; i++) {
@@ -256,8 +252,8 @@ static void store(const struct sum *s, size_t chunk, size_t element, size_t n, d
 static void sum_task(void *ctx, size_t i, int thread)
 {
     const struct sum *s = ctx;
-    size_t chunk = i % s->chunks, unit = i / s->chunks * s->group, n = min(s->units - unit, s->group);
-    size_t begin = chunk * s->chunk, end = min(begin + s->chunk, s->terms);
+    size_t chunk = i % s->chunks, unit = i / s->chunks * s->group, n = dar_least(s->units - unit, s->group);
+    size_t begin = chunk * s->chunk, end = dar_least(begin + s->chunk, s->terms);
     double v[BESIDE][DAR_PIECE];
     (void)thread;
 

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "data/raster_inside.h"
+#include "lib/size.h"
 #include "lib/thread.h"
 
 /* One visible triangle: only what the families asked for need.  Attribute k of corner c is x[c][k]. */
@@ -152,17 +153,12 @@ static void clear_row(const dar_raster *r, const dar_gbuffer *out, size_t at, si
     clear(out->mask, 1, at, n);
 }
 
-static size_t least(size_t a, size_t b)
-{
-    return a < b ? a : b;
-}
-
 void dar_raster_resolve(const dar_raster *r, const dar_pose *p, const dar_gbuffer *out, size_t tile)
 {
     const struct dar_raster_inside *in = r->in;
     size_t width = (size_t)r->config.width, height = (size_t)r->config.height;
     size_t left = tile % in->tiles_x * DAR_TILE_WIDTH, top = tile / in->tiles_x * DAR_TILE_HEIGHT;
-    size_t n = least(DAR_TILE_WIDTH, width - left), bottom = least(top + DAR_TILE_HEIGHT, height);
+    size_t n = dar_least(DAR_TILE_WIDTH, width - left), bottom = dar_least(top + DAR_TILE_HEIGHT, height);
     const double *shown = in->shown + tile * DAR_TILE_PIXELS;
     struct job j = { r, p, out };
     struct surface s;
@@ -186,13 +182,13 @@ static void fill_row(void *ctx, size_t row, int thread)
     const struct dar_raster_inside *in = j->r->in;
     const bool *used = in->used + row * in->tiles_x;
     size_t width = (size_t)j->r->config.width, height = (size_t)j->r->config.height;
-    size_t top = row * DAR_TILE_HEIGHT, bottom = least(top + DAR_TILE_HEIGHT, height);
+    size_t top = row * DAR_TILE_HEIGHT, bottom = dar_least(top + DAR_TILE_HEIGHT, height);
     (void)thread;
 
     for (size_t a = 0, b; a < in->tiles_x; a = b + 1) {
         for (b = a; b < in->tiles_x && !used[b];) b++;
         if (a == b) continue;
-        size_t left = a * DAR_TILE_WIDTH, n = least(b * DAR_TILE_WIDTH, width) - left;
+        size_t left = a * DAR_TILE_WIDTH, n = dar_least(b * DAR_TILE_WIDTH, width) - left;
         if (n == width) clear_row(j->r, j->out, top * width, (bottom - top) * width);
         else
             for (size_t y = top; y < bottom; y++) clear_row(j->r, j->out, y * width + left, n);

@@ -18,6 +18,7 @@
 
 #include "lib/kern.h"
 #include "lib/kern_attn.h"
+#include "lib/size.h"
 #include "lib/status.h"
 #include "lib/thread.h"
 #include "lib/tile.h"
@@ -44,25 +45,10 @@ struct job {
     size_t per_thread;     /* bytes */
 };
 
-static size_t min_size(size_t a, size_t b)
-{
-    return a < b ? a : b;
-}
-
-static size_t ceil_div(size_t a, size_t b)
-{
-    return a / b + (a % b != 0);
-}
-
-static size_t round_up(size_t a, size_t b)
-{
-    return ceil_div(a, b) * b;
-}
-
 /* Cut n in about `parts` ranges of whole blocks, each between least and most. */
 static size_t range_of(size_t n, size_t parts, size_t block, size_t least, size_t most)
 {
-    size_t r = round_up(ceil_div(n, parts), block);
+    size_t r = dar_round_up(dar_blocks(n, parts), block);
     return r < least ? least : r > most ? most : r;
 }
 
@@ -103,18 +89,18 @@ struct carve {
 static void *take(struct carve *c, size_t bytes)
 {
     size_t at = c->used;
-    c->used = dar_add_size(at, round_up(bytes, DAR_ALIGN));
+    c->used = dar_add_size(at, dar_round_up(bytes, DAR_ALIGN));
     return c->base ? c->base + at : NULL;
 }
 
 static size_t bytes_a(const dar_tile *t, size_t m, size_t k)
 {
-    return ceil_div(m, t->mr) * dar_tile_bytes_a(t, k);
+    return dar_blocks(m, t->mr) * dar_tile_bytes_a(t, k);
 }
 
 static size_t bytes_b(const dar_tile *t, size_t n, size_t k)
 {
-    return ceil_div(n, t->nr) * dar_tile_bytes_b(t, k);
+    return dar_blocks(n, t->nr) * dar_tile_bytes_b(t, k);
 }
 
 static char *row_at(const dar_tensor *x, size_t row, size_t col)
@@ -139,7 +125,7 @@ static void pack_rows(const dar_tile *t, bool left, dar_dtype type, const void *
     size_t wide = left ? t->mr : t->nr;
     for (size_t i = 0; i < rows; i += wide) {
         const char *from = (const char *)src + i * ld * dar_dtype_size(type);
-        size_t n = min_size(wide, rows - i);
+        size_t n = dar_least(wide, rows - i);
         if (left) dar_tile_pack_a_mk(t, type, from, ld, n, cols, dst);
         else dar_tile_pack_b_nk(t, type, from, ld, cols, n, dst);
         dst += left ? dar_tile_bytes_a(t, cols) : dar_tile_bytes_b(t, cols);
@@ -152,7 +138,7 @@ static void pack_cols(const dar_tile *t, dar_dtype type, const void *src, size_t
 {
     for (size_t j = 0; j < cols; j += t->nr) {
         const char *from = (const char *)src + j * dar_dtype_size(type);
-        dar_tile_pack_b_kn(t, type, from, ld, rows, min_size(t->nr, cols - j), dst);
+        dar_tile_pack_b_kn(t, type, from, ld, rows, dar_least(t->nr, cols - j), dst);
         dst += dar_tile_bytes_b(t, rows);
     }
 }
@@ -175,12 +161,12 @@ static void product(const dar_tile *t, size_t m, size_t n, size_t k, struct left
     size_t units = dar_tile_units(t, k), size = t->unit_bytes, c_size = t->kind == DAR_TILE_F64 ? 8 : 4;
 
     for (size_t k0 = 0; k0 < units; k0 += DEPTH) {
-        size_t kn = min_size(DEPTH, units - k0);
+        size_t kn = dar_least(DEPTH, units - k0);
         for (size_t j = 0; j < n; j += t->nr) {
             const char *bj = (const char *)b + (j * units + k0 * t->nr) * size;
             for (size_t i = 0; i < m; i += t->mr)
                 t->mm(kn, (const char *)a.at + i / t->mr * a.stripe + k0 * a.k * size, a.row, a.k, bj, t->nr,
-                      (char *)c + (i * ldc + j) * c_size, ldc, min_size(t->mr, m - i), min_size(t->nr, n - j),
+                      (char *)c + (i * ldc + j) * c_size, ldc, dar_least(t->mr, m - i), dar_least(t->nr, n - j),
                       add || k0);
         }
     }
@@ -214,7 +200,7 @@ struct forward_scratch {
 static struct forward_scratch forward_carve(const struct job *j, struct carve *c)
 {
     struct forward_scratch f = { .ld = KEYS + EDGE };
-    size_t rows = min_size(j->range, round_up(j->Nq, ROWS)), keys = min_size(KEYS, j->Nk);
+    size_t rows = dar_least(j->range, dar_round_up(j->Nq, ROWS)), keys = dar_least(KEYS, j->Nk);
 
     f.q = take(c, rows / ROWS * bytes_a(j->inner, ROWS, j->E));
     f.k = take(c, bytes_b(j->inner, keys, j->E));
@@ -235,8 +221,8 @@ static struct job forward_job(const dar_attn *a)
     struct carve c = { 0 };
     size_t heads = j.B * j.A;
 
-    j.range = range_of(j.Nq, ceil_div(TASKS, heads ? heads : 1), ROWS, 8 * ROWS, 32 * ROWS);
-    j.ranges = ceil_div(j.Nq, j.range);
+    j.range = range_of(j.Nq, dar_blocks(TASKS, heads ? heads : 1), ROWS, 8 * ROWS, 32 * ROWS);
+    j.ranges = dar_blocks(j.Nq, j.range);
     forward_carve(&j, &c);
     j.per_thread = c.used;
     return j;
@@ -298,16 +284,16 @@ static void forward_task(void *ctx, size_t task, int thread)
     struct carve c = { (char *)a->scratch + (size_t)thread * j->per_thread, 0 };
     struct forward_scratch f = forward_carve(j, &c);
     size_t head = task / j->ranges, b = head / j->A, col = head % j->A * j->E;
-    size_t q0 = task % j->ranges * j->range, rows = min_size(j->range, j->Nq - q0);
+    size_t q0 = task % j->ranges * j->range, rows = dar_least(j->range, j->Nq - q0);
     size_t q_row = b * j->Nq + q0, k_row = b * j->Nk;
 
     for (size_t k0 = 0; k0 < j->Nk; k0 += KEYS) {
-        size_t n = min_size(KEYS, j->Nk - k0);
+        size_t n = dar_least(KEYS, j->Nk - k0);
         pack_rows(j->inner, false, a->k.dtype, row_at(&a->k, k_row + k0, col), j->D, n, j->E, f.k);
         pack_cols(j->outer, a->v.dtype, row_at(&a->v, k_row + k0, col), j->D, n, j->E, f.v);
         const void *lw = log_weights(j, b, k0, n, f.lw);
         for (size_t i = 0; i < rows; i += ROWS) {
-            size_t m = min_size(ROWS, rows - i);
+            size_t m = dar_least(ROWS, rows - i);
             if (!k0) {
                 pack_rows(j->inner, true, a->q.dtype, row_at(&a->q, q_row + i, col), j->D, m, j->E,
                           f.q + i / ROWS * bytes_a(j->inner, ROWS, j->E));
@@ -344,8 +330,8 @@ void dar_attn_forward(const dar_attn *a)
 /* Keys that a task packs, and whose gradients it sums, at a time. */
 static size_t chunk_of(const struct job *j)
 {
-    size_t n = round_up(CHUNK_SIZE / j->E, ROWS_BACK);
-    return min_size(n < 4 * ROWS_BACK ? 4 * ROWS_BACK : n, round_up(j->split, ROWS_BACK));
+    size_t n = dar_round_up(CHUNK_SIZE / j->E, ROWS_BACK);
+    return dar_least(n < 4 * ROWS_BACK ? 4 * ROWS_BACK : n, dar_round_up(j->split, ROWS_BACK));
 }
 
 struct backward_scratch {
@@ -392,14 +378,14 @@ static struct job backward_job(const dar_attn *a)
 {
     struct job j = job_of(a, QUERIES);
     struct carve c = { 0 };
-    size_t heads = j.B * j.A, parts = ceil_div(TASKS, heads ? heads : 1);
+    size_t heads = j.B * j.A, parts = dar_blocks(TASKS, heads ? heads : 1);
     bool keys = a->gk.data || a->gv.data;
 
-    j.range = keys ? round_up(j.Nq, QUERIES) : range_of(j.Nq, parts, QUERIES, 4 * QUERIES, 32 * QUERIES);
-    j.split = keys ? range_of(j.Nk, parts, ROWS_BACK, 4 * ROWS_BACK, SIZE_MAX) : round_up(j.Nk, ROWS_BACK);
-    j.ranges = j.range ? ceil_div(j.Nq, j.range) : 0;
+    j.range = keys ? dar_round_up(j.Nq, QUERIES) : range_of(j.Nq, parts, QUERIES, 4 * QUERIES, 32 * QUERIES);
+    j.split = keys ? range_of(j.Nk, parts, ROWS_BACK, 4 * ROWS_BACK, SIZE_MAX) : dar_round_up(j.Nk, ROWS_BACK);
+    j.ranges = j.range ? dar_blocks(j.Nq, j.range) : 0;
     if (keys) j.ranges = 1; /* no query: their gradients are 0 */
-    j.splits = j.split ? ceil_div(j.Nk, j.split) : 0;
+    j.splits = j.split ? dar_blocks(j.Nk, j.split) : 0;
     backward_carve(&j, &c);
     j.per_thread = c.used;
     return j;
@@ -428,7 +414,7 @@ static void load_keys(const struct job *j, const struct backward_scratch *f, siz
 {
     const dar_attn *a = j->a;
     for (size_t i = 0; i < n; i += ROWS_BACK) {
-        size_t m = min_size(ROWS_BACK, n - i), block = i / ROWS_BACK;
+        size_t m = dar_least(ROWS_BACK, n - i), block = i / ROWS_BACK;
         pack_rows(j->inner, true, a->k.dtype, row_at(&a->k, row + i, col), j->D, m, j->E,
                   f->k_rows + block * bytes_a(j->inner, ROWS_BACK, j->E));
         if (a->gq.data || a->gk.data)
@@ -515,18 +501,19 @@ static void backward_task(void *ctx, size_t task, int thread)
     struct backward_scratch f = backward_carve(j, &c);
     size_t range = task % j->ranges, split = task / j->ranges % j->splits, head = task / j->ranges / j->splits;
     size_t b = head / j->A, col = head % j->A * j->E, chunk = chunk_of(j);
-    size_t q_end = min_size(j->Nq, (range + 1) * j->range), k_begin = split * j->split;
-    size_t k_end = min_size(j->Nk, k_begin + j->split);
+    size_t q_end = dar_least(j->Nq, (range + 1) * j->range), k_begin = split * j->split;
+    size_t k_end = dar_least(j->Nk, k_begin + j->split);
     dar_tensor gq = dq_of(j, split);
 
     for (size_t k0 = k_begin; k0 < k_end; k0 += chunk) {
-        size_t keys = min_size(chunk, k_end - k0);
+        size_t keys = dar_least(chunk, k_end - k0);
         load_keys(j, &f, b * j->Nk + k0, col, keys);
         bool lw = log_weights(j, b, k0, keys, f.lw);
         for (size_t q0 = range * j->range; q0 < q_end; q0 += QUERIES) {
-            size_t n = min_size(QUERIES, q_end - q0);
+            size_t n = dar_least(QUERIES, q_end - q0);
             load_queries(j, &f, head, q0, n);
-            for (size_t i = 0; i < keys; i += ROWS_BACK) backward_block(j, &f, i, min_size(ROWS_BACK, keys - i), n, lw);
+            for (size_t i = 0; i < keys; i += ROWS_BACK)
+                backward_block(j, &f, i, dar_least(ROWS_BACK, keys - i), n, lw);
             bool add = k0 > k_begin || (!split && a->add_q);
             if (gq.data) store(j, &gq, b * j->Nq + q0, col, n, a->scale, f.dq, add);
         }

@@ -4,12 +4,9 @@
 #include <stdint.h>
 #include <string.h>
 
-#define WORD_MAX 64
+#include "lib/size.h"
 
-static size_t min(size_t a, size_t b)
-{
-    return a < b ? a : b;
-}
+#define WORD_MAX 64
 
 size_t dar_nearest_distance(const char *a, const char *b)
 {
@@ -22,8 +19,9 @@ size_t dar_nearest_distance(const char *a, const char *b)
         size_t *now = row[i % 3], *one = row[(i + 2) % 3], *two = row[(i + 1) % 3];
         now[0] = i;
         for (size_t j = 1; j <= m; j++) {
-            now[j] = min(min(now[j - 1], one[j]) + 1, one[j - 1] + (a[i - 1] != b[j - 1]));
-            if (i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1]) now[j] = min(now[j], two[j - 2] + 1);
+            now[j] = dar_least(dar_least(now[j - 1], one[j]) + 1, one[j - 1] + (a[i - 1] != b[j - 1]));
+            if (i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1])
+                now[j] = dar_least(now[j], two[j - 2] + 1);
         }
     }
     return row[n % 3][m];

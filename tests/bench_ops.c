@@ -324,8 +324,7 @@ static dar_val *call_attention(dar_tape *t, dar_val *const *x, const int64_t *s)
 
 static const bench_kind attention = { BENCH_OP(attention), .inputs = queries_keys_values, .call = call_attention };
 
-/* ---------------------------------------------------------------- convolution: Cin, Cout, T, H, W of a 3x3(x3) kernel
- */
+/* ---------------------------------------------------------------- convolution: Cin, Cout, T, H, W, history */
 
 static void frames(bench *b)
 {
@@ -339,6 +338,7 @@ static void clip(bench *b)
     bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[2], b->s[3], b->s[4]), true);
     bench_input(b, b->row->type, DAR_SHAPE(b->s[1], b->s[0], 3, 3, 3), true);
     bench_input(b, b->row->type, DAR_SHAPE(b->s[1]), true);
+    if (b->s[5]) bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[5], b->s[3], b->s[4]), false);
 }
 
 static dar_val *call_conv2d(dar_tape *t, dar_val *const *x, const int64_t *s)
@@ -349,8 +349,7 @@ static dar_val *call_conv2d(dar_tape *t, dar_val *const *x, const int64_t *s)
 
 static dar_val *call_conv3d(dar_tape *t, dar_val *const *x, const int64_t *s)
 {
-    (void)s;
-    return dar_conv3d(t, x[0], x[1], x[2], NULL, dar_conv_same(x[1]));
+    return dar_conv3d(t, x[0], x[1], x[2], s[5] ? x[3] : NULL, dar_conv_same(x[1]));
 }
 
 static const bench_kind conv2d = { BENCH_OP(conv2d), .inputs = frames, .call = call_conv2d };
@@ -366,6 +365,7 @@ static const bench_kind conv3d = { BENCH_OP(conv3d), .inputs = clip, .call = cal
     }
 #define ATTN(...)         BOTH(attention, BENCH_F32, BENCH_BF16, 0.80, 0.68, __VA_ARGS__)
 #define CONV(kind, ...)   BOTH(kind, BENCH_F32, BENCH_BF16, 0.70, 0.70, __VA_ARGS__)
+#define DECODE(...)       BOTH(conv3d, BENCH_F32, BENCH_BF16, 0.70, 0, __VA_ARGS__) /* never trained */
 #define LINEAR(kind, ...) BOTH(kind, BENCH_F32, BENCH_BF16, 0, 0, __VA_ARGS__)
 #define STREAM(kind, ...) BOTH(kind, BENCH_COPY, BENCH_COPY, 0.80, 0.80, __VA_ARGS__)
 #define PLAIN(kind, ...)  BOTH(kind, BENCH_COPY, BENCH_COPY, 0, 0, __VA_ARGS__)
@@ -382,13 +382,18 @@ const bench_row bench_op_rows[] = {
     ATTN(8192, 24, 128),
     BOTH(attention, BENCH_F32, BENCH_BF16, 0, 0, 1560, 1, 1024), /* the VAE's, one frame of 480 x 832 */
 
-    CONV(conv2d, 384, 384, 5, 8, 14),    /* adapter, small model */
-    CONV(conv2d, 3072, 3072, 1, 16, 28), /* adapter */
-    CONV(conv2d, 1024, 1024, 1, 32, 56), /* VAE decoder, up-sampling */
-    CONV(conv3d, 48, 1024, 4, 16, 28),   /* VAE decoder, first */
-    CONV(conv3d, 1024, 1024, 2, 16, 28), /* VAE decoder, middle */
-    CONV(conv3d, 256, 256, 1, 128, 224), /* VAE decoder, last stage */
-    CONV(conv3d, 160, 160, 4, 64, 112),  /* VAE encoder, first stage */
+    CONV(conv2d, 384, 384, 5, 8, 14),       /* adapter, small model */
+    CONV(conv2d, 3072, 3072, 1, 15, 26),    /* adapter */
+    CONV(conv2d, 1024, 1024, 1, 32, 56),    /* VAE decoder, up-sampling */
+    DECODE(48, 1024, 1, 8, 14, 2),          /* VAE decoder, a latent frame of 128 x 224: first */
+    DECODE(1024, 1024, 1, 8, 14, 2),        /* first stage */
+    CONV(conv3d, 1024, 1024, 2, 16, 28, 2), /* second */
+    CONV(conv3d, 512, 512, 2, 32, 56, 2),   /* third */
+    CONV(conv3d, 256, 256, 1, 64, 112, 2),  /* fourth */
+    DECODE(256, 256, 1, 240, 416, 2),       /* of 480 x 832: fourth */
+    DECODE(256, 12, 1, 240, 416, 2),        /* last */
+    CONV(conv3d, 12, 160, 4, 64, 112),      /* VAE encoder, first */
+    CONV(conv3d, 160, 160, 4, 64, 112),     /* first stage */
 
     STREAM(rms_norm, 8192, 3072),
     STREAM(layer_norm, 8192, 3072),
