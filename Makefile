@@ -129,7 +129,7 @@ $B/speed_%: $B/tests/speed_%.o $B/libdar.a
 	@echo "LD $@"
 	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
 
-everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/speed_raster $B/speed_dit $B/ulp
+everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/speed_raster $B/speed_bundle $B/speed_dit $B/ulp
 
 headers: $(HDR:%=alone/%)
 

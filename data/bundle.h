@@ -173,6 +173,22 @@ typedef struct dar_bundle_frame {
     bool copied;           /* g and sparse equal the frame before: they are looked at for EXR files alone */
 } dar_bundle_frame;
 
+typedef enum dar_bundle_stage {
+    DAR_BUNDLE_ENCODE,   /* values to numbers */
+    DAR_BUNDLE_DEFLATE,  /* numbers to chunks */
+    DAR_BUNDLE_WRITE,    /* chunks to HDF5 */
+    DAR_BUNDLE_PICTURES, /* rgb to PNG and video, EXR files */
+    DAR_BUNDLE_FINISH,   /* flush, sha256, rename */
+    DAR_BUNDLE_STAGES
+} dar_bundle_stage;
+
+/* Sums so far. */
+typedef struct dar_bundle_stats {
+    size_t frames, copied, chunks, empty; /* empty: chunks of zeros, not written */
+    uint64_t bytes;                       /* of chunks */
+    double seconds[DAR_BUNDLE_STAGES];
+} dar_bundle_stats;
+
 typedef struct dar_bundle_writer dar_bundle_writer;
 
 /* Everything that meta points to must live until the writer ends.  Frames, width and height are those of the cameras.
@@ -190,6 +206,8 @@ dar_status dar_bundle_add_tracks(dar_bundle_writer *w, size_t tracks, const floa
 /* A reference of a bundle without rgb; a copy of a file as text.safetensors. */
 dar_status dar_bundle_add_reference(dar_bundle_writer *w, const uint8_t *rgb, dar_err *e);
 dar_status dar_bundle_add_text(dar_bundle_writer *w, const char *path, dar_err *e);
+
+const dar_bundle_stats *dar_bundle_written(const dar_bundle_writer *w);
 
 /* All frames are there: finish the files, flush, rename.  The caller still owes dar_bundle_discard. */
 dar_status dar_bundle_commit(dar_bundle_writer *w, dar_err *e);

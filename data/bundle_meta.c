@@ -101,7 +101,7 @@ static void read_world(dar_bundle_meta *m, dar_json root)
     m->world.size = dar_json_number(j, "size", NAN, 0, DAR_CAMERA_LARGEST);
     dar_json_numbers(j, "box", box, 6);
     if (!(m->world.size > 0)) dar_json_reject(j, "size", "more than 0");
-    if (!sound_box(box)) dar_json_reject(j, "box", "lowest x y z, highest x y z");
+    if (!sound_box(box)) dar_json_reject(j, "box", "lowest x y z, then highest x y z");
     for (int k = 0; k < 3; k++) m->world.lo[k] = box[k], m->world.hi[k] = box[3 + k];
 }
 
@@ -111,7 +111,7 @@ static dar_status read_boxes(dar_bundle_meta *m, dar_json root, dar_err *e)
     size_t n = dar_json_size(list), t = 0;
     if (!n) return DAR_OK;
     if (n != m->frames) {
-        dar_json_reject(root, "boxes", "one for each of %zu frames", m->frames);
+        dar_json_reject(root, "boxes", "one for each of %zu frames, not %zu", m->frames, n);
         return DAR_OK;
     }
     dar_box *box = calloc(n, sizeof *box);
@@ -121,7 +121,7 @@ static dar_status read_boxes(dar_bundle_meta *m, dar_json root, dar_err *e)
     for (dar_json j = dar_json_first(list); j.item; j = dar_json_next(j), t++) {
         double x[6] = { NAN };
         dar_json_numbers(j, NULL, x, 6);
-        if (!sound_box(x)) dar_json_reject(j, NULL, "lowest x y z, highest x y z");
+        if (!sound_box(x)) dar_json_reject(j, NULL, "lowest x y z, then highest x y z");
         memcpy(box[t].lo, x, sizeof box[t].lo);
         memcpy(box[t].hi, x + 3, sizeof box[t].hi);
     }
@@ -158,8 +158,8 @@ static dar_status read_files(dar_bundle_contents *c, dar_json root, dar_err *e)
         if (!dar_bundle_is_file(name, c->meta.frames)) dar_json_reject(j, NULL, "a name that a bundle's file can have");
         snprintf(f->name, sizeof f->name, "%s", name);
         f->bytes = (uint64_t)dar_json_int(j, "bytes", DAR_JSON_NEEDED, 0, MAX_BYTES);
-        const char *sum = dar_json_text(j, "sha256", NULL);
-        if (!sum) continue;
+        const char *sum = dar_json_text(j, "sha256", "");
+        if (!*sum) continue;
         if (strlen(sum) != DAR_SHA256_TEXT - 1 || strspn(sum, "0123456789abcdef") != strlen(sum))
             dar_json_reject(j, "sha256", "64 of the digits 0 to f");
         snprintf(f->sha256, sizeof f->sha256, "%s", sum);

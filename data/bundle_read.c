@@ -164,34 +164,43 @@ static dar_status make_buffers(dar_bundle *b, dar_err *e)
                                              b->meta.width, b->meta.height);
 }
 
-static dar_status read_h5(dar_bundle *b, int family, size_t frame, void *to, dar_err *e)
+/* gbuffer.h5, and in it the dataset as the metadata says. */
+static dar_status open_h5(dar_bundle *b, int family, dar_err *e)
 {
     struct dar_bundle_inside *in = b->in;
     char path[PATH_MAX];
-    const char *name = dar_bundle_table[family].dataset;
     dar_h5_array a = dar_bundle_array(family, in->c.store[family].type, &b->meta);
+    if (in->checked >> family & 1) return DAR_OK;
     if (!in->gbuffer) DAR_TRY(dar_h5_open(&in->gbuffer, dar_bundle_path(b, DAR_BUNDLE_GBUFFER, path), e));
-    if (!(in->checked >> family & 1)) DAR_TRY(dar_h5_expect(in->gbuffer, name, &a, e));
+    DAR_TRY(dar_h5_expect(in->gbuffer, dar_bundle_table[family].dataset, &a, e));
     in->checked |= 1u << family;
-    return dar_h5_read(in->gbuffer, name, &a, frame, 1, to, e);
+    return DAR_OK;
 }
 
-/* One family of the frame's EXR file, which stays open for the next. */
-static dar_status read_exr(dar_bundle *b, int family, size_t frame, void *to, dar_err *e)
+/* The frame's EXR file, which stays open for its other families. */
+static dar_status open_exr(dar_bundle *b, size_t frame, dar_err *e)
 {
     struct dar_bundle_inside *in = b->in;
     char name[32], path[PATH_MAX];
-    dar_gbuffer g = { 0 };
-    dar_bundle_path(b, dar_bundle_exr_name(frame, name), path);
-    if (!in->exr || in->exr_frame != frame) {
-        dar_exr_close(in->exr);
-        in->exr = NULL;
-        DAR_TRY(dar_exr_open(&in->exr, path, e));
-        in->exr_frame = frame;
-        if (dar_exr_width(in->exr) != (size_t)b->meta.width || dar_exr_height(in->exr) != (size_t)b->meta.height)
-            return dar_fail(e, DAR_ERR_FORMAT, "%s: found %zu x %zu, expected %d x %d", path, dar_exr_width(in->exr),
-                            dar_exr_height(in->exr), b->meta.width, b->meta.height);
+    dar_exr *x;
+    if (in->exr && in->exr_frame == frame) return DAR_OK;
+    DAR_TRY(dar_exr_open(&x, dar_bundle_path(b, dar_bundle_exr_name(frame, name), path), e));
+    size_t width = dar_exr_width(x), height = dar_exr_height(x);
+    if (width != (size_t)b->meta.width || height != (size_t)b->meta.height) {
+        dar_exr_close(x);
+        return dar_fail(e, DAR_ERR_FORMAT, "%s: found %zu x %zu, expected %d x %d", path, width, height, b->meta.width,
+                        b->meta.height);
     }
+    dar_exr_close(in->exr);
+    in->exr = x;
+    in->exr_frame = frame;
+    return DAR_OK;
+}
+
+static dar_status read_exr(dar_bundle *b, int family, size_t frame, void *to, dar_err *e)
+{
+    char name[32], path[PATH_MAX];
+    dar_gbuffer g = { 0 };
     switch (family) { /* the metadata lets no other pass */
     case DAR_FAMILY_TRACKING: g.tracking = to; break;
     case DAR_FAMILY_WORLD: g.world = to; break;
@@ -201,14 +210,23 @@ static dar_status read_exr(dar_bundle *b, int family, size_t frame, void *to, da
     case DAR_BUNDLE_ID: g.instance = to; break;
     case DAR_BUNDLE_PART: g.part = to; break;
     }
-    return dar_bundle_exr_read(in->exr, path, &g, e);
+    return dar_bundle_exr_read(b->in->exr, dar_bundle_path(b, dar_bundle_exr_name(frame, name), path), &g, e);
+}
+
+/* Everything that can be wrong but for the numbers is told here, before there is memory for them. */
+static dar_status open_family(dar_bundle *b, int family, size_t frame, dar_err *e)
+{
+    DAR_ASSERT(frame < b->meta.frames, "bundle: frame %zu of %zu", frame, b->meta.frames);
+    DAR_TRY(dar_bundle_need(b, family, e));
+    return b->in->c.store[family].exr ? open_exr(b, frame, e) : open_h5(b, family, e);
 }
 
 static dar_status read_family(dar_bundle *b, int family, size_t frame, void *to, dar_err *e)
 {
-    DAR_ASSERT(frame < b->meta.frames, "bundle: frame %zu of %zu", frame, b->meta.frames);
-    DAR_TRY(dar_bundle_need(b, family, e));
-    return (b->in->c.store[family].exr ? read_exr : read_h5)(b, family, frame, to, e);
+    const dar_bundle_store *s = &b->in->c.store[family];
+    dar_h5_array a = dar_bundle_array(family, s->type, &b->meta);
+    if (s->exr) return read_exr(b, family, frame, to, e);
+    return dar_h5_read(b->in->gbuffer, dar_bundle_table[family].dataset, &a, frame, 1, to, e);
 }
 
 static dar_status read_plane(dar_bundle *b, dar_family family, size_t frame, dar_plane *plane, dar_err *e)
@@ -218,6 +236,7 @@ static dar_status read_plane(dar_bundle *b, dar_family family, size_t frame, dar
                                                        [DAR_H5_I16] = DAR_PLANE_I16,
                                                        [DAR_H5_F32] = DAR_PLANE_F32 };
     const dar_bundle_store *s = &b->in->c.store[family];
+    DAR_TRY(open_family(b, family, frame, e));
     DAR_TRY(make_buffers(b, e));
     DAR_TRY(read_family(b, family, frame, b->in->plane, e));
     *plane = (dar_plane){ .type = type[s->type], .data = b->in->plane };
@@ -262,6 +281,7 @@ dar_status dar_bundle_values(dar_bundle *b, dar_family family, size_t frame, flo
 dar_status dar_bundle_numbers(dar_bundle *b, dar_bundle_family family, size_t frame, uint32_t *y, dar_err *e)
 {
     DAR_ASSERT(family == DAR_BUNDLE_ID || family == DAR_BUNDLE_PART, "bundle: numbers of family %d", (int)family);
+    DAR_TRY(open_family(b, (int)family, frame, e));
     return read_family(b, (int)family, frame, y, e);
 }
 

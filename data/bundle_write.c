@@ -14,6 +14,7 @@
 #include "data/video.h"
 #include "lib/dir.h"
 #include "lib/file.h"
+#include "lib/log.h"
 #include "lib/sha256.h"
 #include "lib/thread.h"
 
@@ -35,6 +36,7 @@ struct dar_bundle_writer {
     dar_arena arena;
     dar_deflate_stream stream[STREAMS]; /* data: encoded frame, out: its chunk, kept for copies */
     size_t pixels, frame;
+    dar_bundle_stats stats;
 };
 
 static dar_h5_array rgb_array(const dar_bundle_meta *m)
@@ -286,10 +288,14 @@ static dar_status write_chunks(dar_bundle_writer *w, dar_err *e)
     for (int i = 0; i < STREAMS; i++) {
         const dar_deflate_stream *x = &w->stream[i];
         bool rgb = i == RGB;
-        if (!x->size || x->zero) continue; /* what is not written reads as zero */
+        if (!x->size) continue;
+        w->stats.empty += x->zero;
+        if (x->zero) continue; /* what is not written reads as zero */
         dar_h5_array a = rgb ? rgb_array(&w->c.meta) : dar_bundle_array(i, w->c.store[i].type, &w->c.meta);
         DAR_TRY(dar_h5_write_chunk(rgb ? w->rgb : w->gbuffer, rgb ? "rgb" : dar_bundle_table[i].dataset, &a, w->frame,
                                    x->out, x->out_size, e));
+        w->stats.chunks++;
+        w->stats.bytes += x->out_size;
     }
     return DAR_OK;
 }
@@ -306,20 +312,40 @@ static dar_status add_rgb(dar_bundle_writer *w, const uint8_t *rgb, dar_err *e)
     return w->video ? dar_video_write(w->video, rgb, e) : DAR_OK;
 }
 
+/* The time since *mark, which moves on, belongs to a stage. */
+static void lap(dar_bundle_writer *w, dar_bundle_stage stage, double *mark)
+{
+    double now = dar_log_clock();
+    w->stats.seconds[stage] += now - *mark;
+    *mark = now;
+}
+
 dar_status dar_bundle_add(dar_bundle_writer *w, const dar_bundle_frame *f, dar_err *e)
 {
+    double mark = dar_log_clock();
     DAR_ASSERT(w->frame < w->c.meta.frames, "bundle: more than %zu frames", w->c.meta.frames);
     DAR_ASSERT(!f->copied || w->frame > 0, "bundle: frame 0 has nothing before it");
     if (w->rgb) DAR_TRY(add_rgb(w, f->rgb, e));
+    if (w->o.exr) DAR_TRY(write_exr(w, f, e));
+    lap(w, DAR_BUNDLE_PICTURES, &mark);
     for (int i = 0; i < DAR_BUNDLE_FAMILIES && !f->copied; i++)
         if (w->stream[i].size) DAR_TRY(encode(w, f, i, e));
     if (!f->copied && w->c.store[DAR_FAMILY_DEPTH].there) extend_depth(w, f);
-    if (f->copied) dar_deflate_run(w->deflate, w->stream + RGB, w->rgb ? 1 : 0);
+    lap(w, DAR_BUNDLE_ENCODE, &mark);
+    if (f->copied) dar_deflate_run(w->deflate, w->stream + RGB, 1);
     else dar_deflate_run(w->deflate, w->stream, STREAMS);
+    lap(w, DAR_BUNDLE_DEFLATE, &mark);
     DAR_TRY(write_chunks(w, e));
-    if (w->o.exr) DAR_TRY(write_exr(w, f, e));
+    lap(w, DAR_BUNDLE_WRITE, &mark);
     w->frame++;
+    w->stats.frames++;
+    w->stats.copied += f->copied;
     return DAR_OK;
+}
+
+const dar_bundle_stats *dar_bundle_written(const dar_bundle_writer *w)
+{
+    return &w->stats;
 }
 
 /* ---------------------------------------------------------------- what comes once */
@@ -427,13 +453,16 @@ static dar_status write_meta(dar_bundle_writer *w, dar_err *e)
 
 dar_status dar_bundle_commit(dar_bundle_writer *w, dar_err *e)
 {
+    double mark = dar_log_clock();
     DAR_ASSERT(w->frame == w->c.meta.frames, "bundle: %zu of %zu frames", w->frame, w->c.meta.frames);
     if (w->video) DAR_TRY(dar_video_commit(w->video, e));
     DAR_TRY(dar_h5_commit(w->gbuffer, e));
     if (w->rgb) DAR_TRY(dar_h5_commit(w->rgb, e));
     DAR_TRY(list_files(w, e));
     DAR_TRY(write_meta(w, e));
-    return dar_dir_commit(&w->dir, w->o.overwrite, e);
+    DAR_TRY(dar_dir_commit(&w->dir, w->o.overwrite, e));
+    lap(w, DAR_BUNDLE_FINISH, &mark);
+    return DAR_OK;
 }
 
 /* ---------------------------------------------------------------- afterwards */

@@ -211,6 +211,7 @@ def corpus():
     put("exr", exr_files())
     put("obj", obj_files())
     put("image", image_files())
+    put("bundle", bundle_files())
 
 
 def gltf_files():
@@ -289,6 +290,72 @@ def gltf_files():
     files["glb_cut"] = files["glb"][:-9]
     files["glb_length"] = b"glTF" + struct.pack("<II", 2, 2**32 - 1) + chunks
     return files
+
+
+def bundle_files():
+    """meta.json, a form feed, cameras.json."""
+    import json
+
+    def cameras(frames):
+        return json.dumps({"format": "dar-cameras/1", "width": 4, "height": 3, "cameras": [
+            {"K": [[4, 0, 2], [0, 4, 1.5], [0, 0, 1]], "near": 0.1,
+             "c2w": [[1, 0, 0, t], [0, 1, 0, 0], [0, 0, 1, -3], [0, 0, 0, 1]]} for t in range(frames)]})
+
+    def file(views=1, **more):
+        least = {"format": "dar-bundle/1", "width": 4, "height": 3, "frames": 1, "fps": 24}
+        return (json.dumps(least | more) + "\f" + cameras(views)).encode()
+
+    def families(**f):
+        return file(families=f)
+
+    def inside(type, **more):
+        return {"type": type} | more
+
+    whole = file(
+        5, frames=5, up="z", unit=1, rgb=True, reference=True, text=True, tracks=20, seed=2**53 - 1,
+        families={
+            "tracking": inside("u16", file="gbuffer.h5", scheme="rest-cells", scale=[1.5e-5] * 3, offset=[0] * 3),
+            "world": inside("u16", scale=[1e-4] * 3, offset=[-1, -2, -3]), "normal": inside("i16"),
+            "depth": inside("f32"), "mask": inside("u8"), "sparse": inside("u8"), "id": inside("u32"),
+            "part": inside("u32")},
+        conventions={"camera": "opencv", "pixel_centre": "half", "depth": "view-z", "normal": "world",
+                     "background": "zero", "rgb": "srgb-display"},
+        generator="dar-bundle 0.1", source={"path": "a.glb", "sha256": "00", "licence": "CC0", "animation": "walk"},
+        trajectory="orbit", prompt="a \u00f6", world={"center": [0, 1, 2], "size": 3, "box": [-1, -1, -1, 1, 1, 1]},
+        depth_range=[1, 4], objects=[{"name": "ball", "parts": 2}, {"name": "ring"}], boxes=[[0, 0, 0, 1, 1, 1]] * 5,
+        files={"cameras.json": {"bytes": 10, "sha256": "0" * 64}, "exr/00004.exr": {"bytes": 7}},
+        qc={"ok": False, "reasons": ["dark"]}, extra={"a": [1, {}]})
+    return {
+        "empty": b"",
+        "least": file(),
+        "whole": whole,
+        "whole_no_cameras": whole.split(b"\f")[0],
+        "exr": families(depth=inside("f32", file="exr"), mask=inside("u8", file="exr"), id=inside("u32", file="exr")),
+        "f32": families(world=inside("f32"), normal=inside("f32"), tracking=inside("u8")),
+        "world_u16_bare": families(world=inside("u16")),
+        "scale_zero": families(normal=inside("i16", scale=[1, 0, 1], offset=[0, 0, 0])),
+        "exr_u16": families(normal=inside("i16", file="exr")),
+        "sparse_exr": families(sparse=inside("f32", file="exr")),
+        "next_version": file(format="dar-bundle/2"),
+        "no_format": b'{"frames": 1}',
+        "frames_differ": file(5, frames=9),
+        "size_differs": file(width=5),
+        "huge": file(width=16384, height=16384, frames=65536),
+        "beyond": file(width=1e9, frames=-1),
+        "boxes_short": file(5, frames=5, boxes=[[0] * 6]),
+        "box_upside_down": file(boxes=[[1, 0, 0, 0, 0, 0]]),
+        "world_flat": file(world={"center": [0, 0, 0], "size": 0, "box": [0] * 6}),
+        "depth_backwards": file(depth_range=[3, 1]),
+        "file_outside": file(files={"../../etc/passwd": {"bytes": 1}}),
+        "file_exr_beyond": file(files={"exr/00001.exr": {"bytes": 1}}),
+        "sha_short": file(files={"rgb.h5": {"bytes": 1, "sha256": "abc"}}),
+        "typo": file(famlies={}),
+        "types": file(width="4", height=[], frames={}, fps=None, families=[]),
+        "nulls": file(families=None, world=None, boxes=None, objects=None, files=None, source=None),
+        "seed_large": file(seed=2**60),
+        "cut": whole[:700],
+        "cut_cameras": file()[:-60],
+    }
 
 
 def obj_files():

@@ -6,6 +6,7 @@
 #include "lib/file.h"
 
 /* LLVMFuzzerTestOneInput of tests/fuzz_json.c and so on, renamed by the Makefile. */
+int fuzz_bundle(const uint8_t *data, size_t size);
 int fuzz_camera(const uint8_t *data, size_t size);
 int fuzz_exr(const uint8_t *data, size_t size);
 int fuzz_gltf(const uint8_t *data, size_t size);
@@ -36,6 +37,12 @@ static void replay(const char *dir, int (*target)(const uint8_t *, size_t))
     }
     closedir(d);
     CHECK(files >= 10, "%s: %d files", dir, files);
+}
+
+static void bundle(void **state)
+{
+    (void)state;
+    replay("tests/corpus/bundle", fuzz_bundle);
 }
 
 static void camera(void **state)
@@ -88,9 +95,10 @@ static void torch_file(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = { cmocka_unit_test(camera),      cmocka_unit_test(exr),
-                                        cmocka_unit_test(gltf),        cmocka_unit_test(image),
-                                        cmocka_unit_test(json),        cmocka_unit_test(obj),
-                                        cmocka_unit_test(safetensors), cmocka_unit_test(torch_file) };
+    const struct CMUnitTest tests[] = { cmocka_unit_test(bundle),    cmocka_unit_test(camera),
+                                        cmocka_unit_test(exr),       cmocka_unit_test(gltf),
+                                        cmocka_unit_test(image),     cmocka_unit_test(json),
+                                        cmocka_unit_test(obj),       cmocka_unit_test(safetensors),
+                                        cmocka_unit_test(torch_file) };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
