@@ -178,31 +178,10 @@ void dar_vae_init(dar_vae *v, dar_params *p, const dar_vae_config *c)
 
 /* ---------------------------------------------------------------- folded up-sampling */
 
-/* Row 2 h + parity of the large grid reads rows of the small one: tap k of three becomes tap place[parity][k] of two.
- */
-static const int place[2][3] = { { 0, 1, 1 }, { 0, 0, 1 } };
-
-static void fold(const dar_tensor *w, int row, int column, const dar_tensor *out)
-{
-    size_t pairs = (size_t)(w->shape.d[0] * w->shape.d[1]);
-    for (size_t i = 0; i < pairs; i++) {
-        double sum[4] = { 0 };
-        for (int y = 0; y < 3; y++)
-            for (int x = 0; x < 3; x++)
-                sum[2 * place[row][y] + place[column][x]] +=
-                    dar_dtype_get(w->dtype, w->data, 9 * i + (size_t)(3 * y + x));
-        for (size_t k = 0; k < 4; k++) dar_dtype_set(out->dtype, out->data, 4 * i + k, sum[k]);
-    }
-}
-
 void dar_vae_fold(dar_vae *v, dar_arena *a)
 {
     for (int i = 0; i < v->c.levels; i++) {
         dar_vae_level *l = &v->decoder.level[i];
-        if (!l->halve) continue;
-        for (int k = 0; k < 4; k++) {
-            l->folded[k] = dar_tensor_push(a, v->storage, DAR_SHAPE(l->out, l->out, 2, 2));
-            if (!a->plan) fold(&l->space.w->x, k / 2, k % 2, &l->folded[k]);
-        }
+        if (l->halve) l->folded = dar_double_fold(&l->space.w->x, v->storage, a);
     }
 }

@@ -17,6 +17,7 @@
 
 #include "autograd/ops.h"
 #include "models/config.h"
+#include "models/double.h"
 #include "models/params.h"
 
 /* ---------------------------------------------------------------- parameters */
@@ -37,7 +38,7 @@ typedef struct dar_vae_level {
     int64_t in, out;
     bool halve, halve_time;   /* encoder: at its end; decoder: the reverse */
     dar_vae_conv space, time; /* of that */
-    dar_tensor folded[4];     /* decoder: `space` on the small grid (dar_vae_fold); data NULL: not there */
+    dar_double folded;        /* decoder: `space` on the small grid (dar_vae_fold) */
 } dar_vae_level;
 
 typedef struct dar_vae_half {
@@ -61,8 +62,8 @@ typedef struct dar_vae {
 /* Declare all parameters, under the names of the public checkpoint.  *v must stay where it is. */
 void dar_vae_init(dar_vae *v, dar_params *p, const dar_vae_config *c);
 
-/* Sum the taps of the 3 x 3 convolutions behind nearest up-sampling: four 2 x 2 convolutions on the small grid, 4/9 of
- * the work, used when nothing is recorded.  After the parameters have their values; memory in `a`. */
+/* Fold the decoder's convolutions behind up-sampling (models/double.h), for use when nothing is recorded.  After the
+ * parameters have their values; memory in `a`. */
 void dar_vae_fold(dar_vae *v, dar_arena *a);
 
 /* ---------------------------------------------------------------- whole clips */
@@ -107,6 +108,9 @@ void dar_vae_stream_init(dar_vae_stream *s, const dar_vae *v, dar_vae_side side,
 
 /* The first frame [B, 3, 1, H, W], then s frames each -> moments of one latent frame, on the tape's arena. */
 dar_val *dar_vae_encode_next(dar_vae_stream *s, dar_tape *t, dar_val *x);
+
+/* Contiguous pixels of the main type, cut to [-1, 1] in place. */
+void dar_vae_clamp(const dar_tensor *x);
 
 /* One latent frame z [B, C, 1, h, w].  sink gets each frame [B, 3, 1, H, W], main type, clamped to [-1, 1], in order;
  * its memory is gone afterwards.  sink NULL: nobody looks. */

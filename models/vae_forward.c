@@ -214,32 +214,12 @@ static dar_val *double_time(dar_tape *t, const struct pass *p, const dar_vae_con
     return dar_concat(t, (dar_val *[]){ dar_slice(t, x, 2, 0, 1), rest }, 2, 2);
 }
 
-/* Each of the four folded convolutions makes the pixels of one parity. */
-static dar_val *double_folded(dar_tape *t, const dar_vae_level *l, dar_val *x)
-{
-    const int64_t *d = x->x.shape.d;
-    dar_val *y = dar_input(t, x->x.dtype, DAR_SHAPE(d[0], l->out, d[2], 2 * d[3], 2 * d[4]));
-    dar_mark m = dar_arena_mark(t->arena);
-    for (int k = 0; k < 4; k++) {
-        int row = k / 2, column = k % 2;
-        dar_conv_attr a = { .stride = 1, .top = !row, .bottom = row, .left = !column, .right = column };
-        dar_val *part = dar_conv2d(t, x, dar_leaf(t, l->folded[k], NULL), dar_param_leaf(t, l->space.b), a);
-        dar_tensor to = y->x;
-        to.shape = part->x.shape;
-        to.data = dar_tensor_at(&y->x, (size_t)(row * 2 * d[4] + column));
-        to.stride[3] *= 2;
-        to.stride[4] *= 2;
-        if (!t->arena->plan) dar_tensor_copy(&to, &part->x);
-        dar_arena_reset(t->arena, m);
-    }
-    return y;
-}
-
 static dar_val *double_space(dar_tape *t, const struct pass *p, const dar_vae_level *l, dar_val *x)
 {
-    if (l->folded[0].data && !t->recording) return double_folded(t, l, x);
+    dar_val *b = dar_param_leaf(t, l->space.b);
+    if (l->folded.w[0].data && !t->recording) return dar_double_forward(t, &l->folded, b, x);
     dar_val *w = weight(t, p, &l->space);
-    return dar_conv2d(t, dar_upsample_nearest(t, x, 2), w, dar_param_leaf(t, l->space.b), dar_conv_same(w));
+    return dar_conv2d(t, dar_upsample_nearest(t, x, 2), w, b, dar_conv_same(w));
 }
 
 static dar_val *up_level(dar_tape *t, const struct pass *p, const dar_vae_level *l, dar_val *in)
@@ -335,7 +315,7 @@ dar_val *dar_vae_encode_next(dar_vae_stream *s, dar_tape *t, dar_val *x)
     return x;
 }
 
-static void clamp(const dar_tensor *x)
+void dar_vae_clamp(const dar_tensor *x)
 {
     size_t n = dar_tensor_count(x);
     float *f = x->data;
@@ -366,7 +346,7 @@ dar_status dar_vae_decode_next(dar_vae_stream *s, dar_tape *t, dar_val *z, dar_v
         dar_val *y = dar_contiguous(t, dar_slice(t, x, 2, f, 1));
         for (int i = last; i < v->c.levels; i++) y = up_level(t, &p, &v->decoder.level[i], y);
         y = decoder_end(t, &p, y);
-        if (!t->arena->plan) clamp(&y->x);
+        if (!t->arena->plan) dar_vae_clamp(&y->x);
         if (sink) status = sink(ctx, &y->x, first + f, e);
         dar_arena_reset(t->arena, m);
     }
