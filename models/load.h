@@ -19,7 +19,7 @@
  * the network's are widened (dar_adapter_bind); residual blocks beyond the file's are made anew, as identity. */
 dar_status dar_load_dit(dar_dit *m, dar_params *p, dar_weights *w, uint64_t seed, dar_err *e);
 
-/* Into the table that dar_vae_init filled. */
+/* Into a table that dar_vae_init, or dar_taew_init, filled and nobody else. */
 dar_status dar_load_vae(dar_params *p, dar_weights *w, dar_err *e);
 
 /* The name that a parameter has in diffusers: of the transformer, of the autoencoder. */
