@@ -15,10 +15,10 @@
 #define STANDARD_FRAMES     81
 #define STANDARD_TRAJECTORY "orbit-30"
 
-/* For estimates: bytes of families that one processor encodes, deflates and writes in a second, and what is left of
- * them, for an object that covers a quarter of the picture. */
-#define WRITE_RATE  3e8
-#define WRITE_RATIO 0.03
+/* For estimates: bytes of families that two processors encode, deflate and write in a second, and what is left of
+ * them, as measured with an object that covers a tenth of the picture. */
+#define WRITE_RATE  7e8
+#define WRITE_RATIO 0.045
 
 static struct {
     const char *out, *camera, *camera_name, *trajectory, *animation, *families, *rgb, *reference, *prompt, *licence;

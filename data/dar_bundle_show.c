@@ -139,6 +139,128 @@ static dar_status paint_rays(struct show *s, int component, dar_err *e)
     return DAR_OK;
 }
 
+/* ---------------------------------------------------------------- the path from above */
+
+/* Of the world's two level axes to the picture: x to the right; z, or with z up -y, downwards. */
+struct map {
+    double lo[2], hi[2], scale, left, top;
+};
+
+static void level(const struct show *s, const double x[3], double y[2])
+{
+    y[0] = x[0];
+    y[1] = s->b->meta.z_up ? -x[1] : x[2];
+}
+
+static void reach(const struct show *s, struct map *m, const double x[3])
+{
+    double y[2];
+    level(s, x, y);
+    for (int k = 0; k < 2; k++) {
+        m->lo[k] = fmin(m->lo[k], y[k]);
+        m->hi[k] = fmax(m->hi[k], y[k]);
+    }
+}
+
+static void place_of(const dar_view *v, double x[3])
+{
+    for (int k = 0; k < 3; k++) x[k] = v->c2w[4 * k + 3];
+}
+
+/* The box of the frame; false: unknown. */
+static bool box_of(const struct show *s, dar_box *box)
+{
+    const dar_bundle_meta *m = &s->b->meta;
+    if (m->boxes) *box = m->box[m->boxes > 1 ? s->frame : 0];
+    else if (m->world.size > 0)
+        memcpy(box->lo, m->world.lo, sizeof box->lo), memcpy(box->hi, m->world.hi, sizeof box->hi);
+    return m->boxes || m->world.size > 0;
+}
+
+/* All cameras and boxes, with a margin around them. */
+static struct map map_of(struct show *s)
+{
+    struct map m = { { INFINITY, INFINITY }, { -INFINITY, -INFINITY }, 1, 0, 0 };
+    double x[3], w = (double)s->width, h = (double)s->height;
+    size_t frame = s->frame;
+    dar_box box;
+    for (s->frame = 0; s->frame < s->b->meta.frames; s->frame++) {
+        place_of(&s->b->cameras.view[s->frame], x);
+        reach(s, &m, x);
+        if (!box_of(s, &box)) continue;
+        reach(s, &m, box.lo);
+        reach(s, &m, box.hi);
+    }
+    s->frame = frame;
+    double across = fmax(m.hi[0] - m.lo[0], 1e-9), down = fmax(m.hi[1] - m.lo[1], 1e-9);
+    m.scale = 0.86 * fmin(w / across, h / down);
+    m.left = (w - m.scale * across) / 2;
+    m.top = (h - m.scale * down) / 2;
+    return m;
+}
+
+/* A line between two places of the world, as wide as will be seen when the picture is shrunk. */
+static void draw_line(struct show *s, const struct map *m, const double a[3], const double b[3], const uint8_t color[3])
+{
+    double p[2], q[2], width = fmax(1, (double)s->width / (double)o.width);
+    level(s, a, p);
+    level(s, b, q);
+    double steps = ceil(m->scale * fmax(fabs(q[0] - p[0]), fabs(q[1] - p[1]))) + 1;
+    for (double i = 0; i <= steps; i++) {
+        double x = m->left + m->scale * (p[0] + (q[0] - p[0]) * i / steps - m->lo[0]);
+        double y = m->top + m->scale * (p[1] + (q[1] - p[1]) * i / steps - m->lo[1]);
+        for (double v = floor(y - width / 2 + 0.5); v < y + width / 2; v++)
+            for (double u = floor(x - width / 2 + 0.5); u < x + width / 2; u++)
+                if (u >= 0 && v >= 0 && u < (double)s->width && v < (double)s->height)
+                    memcpy(s->rgb + 3 * ((size_t)v * s->width + (size_t)u), color, 3);
+    }
+}
+
+static void draw_box(struct show *s, const struct map *m, const dar_box *box, const uint8_t color[3])
+{
+    const int up = s->b->meta.z_up ? 2 : 1, side = 3 - up;
+    double corner[4][3];
+    for (int i = 0; i < 4; i++) {
+        memcpy(corner[i], box->lo, sizeof corner[i]);
+        corner[i][0] = i == 1 || i == 2 ? box->hi[0] : box->lo[0];
+        corner[i][side] = i >= 2 ? box->hi[side] : box->lo[side];
+    }
+    for (int i = 0; i < 4; i++) draw_line(s, m, corner[i], corner[(i + 1) % 4], color);
+}
+
+static dar_status paint_path(struct show *s, int family, dar_err *e)
+{
+    static const uint8_t way[3] = { 90, 110, 150 }, surface[3] = { 110, 200, 120 }, view[3] = { 255, 190, 70 };
+    const dar_view *now = &s->b->cameras.view[s->frame];
+    const struct map m = map_of(s);
+    double a[3], b[3], d[3], centre[3], far = 0;
+    dar_box box;
+    (void)family, (void)e;
+    memset(s->rgb, 0, 3 * s->pixels);
+    for (size_t t = 1; t < s->b->cameras.frames; t++) {
+        place_of(&s->b->cameras.view[t - 1], a);
+        place_of(&s->b->cameras.view[t], b);
+        draw_line(s, &m, a, b, way);
+    }
+    place_of(now, a);
+    if (box_of(s, &box)) {
+        draw_box(s, &m, &box, surface);
+        for (int k = 0; k < 3; k++) {
+            centre[k] = (box.lo[k] + box.hi[k]) / 2;
+            far += (centre[k] - a[k]) * now->c2w[4 * k + 2];
+        }
+    }
+    for (int edge = 0; edge < 2; edge++) { /* left and right edge of the picture, as deep as the box */
+        double x = ((edge ? now->width : 0) - now->cx) / now->fx;
+        for (int k = 0; k < 3; k++) {
+            d[k] = x * now->c2w[4 * k] + now->c2w[4 * k + 2];
+            b[k] = a[k] + fmax(far, 0.1 * (double)s->height / m.scale) * d[k];
+        }
+        draw_line(s, &m, a, b, view);
+    }
+    return DAR_OK;
+}
+
 /* ---------------------------------------------------------------- rows */
 
 struct row {
@@ -149,7 +271,7 @@ struct row {
     char note[128];
 };
 
-#define MOST_ROWS (DAR_BUNDLE_FAMILIES + 4)
+#define MOST_ROWS (DAR_BUNDLE_FAMILIES + 5)
 
 static const struct row families[DAR_BUNDLE_FAMILIES] = {
     { "tracking", paint_colors, DAR_FAMILY_TRACKING, DAR_SHRINK_MEAN,
@@ -183,6 +305,8 @@ static size_t list_rows(const struct show *s, struct row *row)
         row[n] = families[f];
         note_of(s, &row[n++]);
     }
+    row[n++] =
+        (struct row){ "path", paint_path, 0, DAR_SHRINK_BRIGHTEST, "from above: camera, its view, box of the scene" };
     row[n++] = (struct row){ "ray", paint_rays, RAY_DIRECTION, DAR_SHRINK_MEAN,
                              "direction, seen from camera 0: x right, y down, z ahead" };
     row[n] = (struct row){ "moment", paint_rays, RAY_MOMENT, DAR_SHRINK_MEAN, "" };

@@ -234,7 +234,7 @@ static void from_scene_to_sheet(void **state)
     assert_int_equal(dar_image_probe(&im, "sheet.png", m.data, m.size, &e), DAR_OK);
     dar_file_map_close(&m);
     CHECK(printed(NULL, "width") == (double)im.width && printed(NULL, "height") == (double)im.height &&
-              printed(NULL, "rows") == DAR_BUNDLE_FAMILIES + 2,
+              printed(NULL, "rows") == DAR_BUNDLE_FAMILIES + 3,
           "%zu x %zu: %s", im.width, im.height, ran.out);
 
     GOOD("render", "--list-trajectories");
