@@ -6,6 +6,7 @@
 #include "lib/thread.h"
 
 #define CHUNK 16384 /* numbers of a task */
+#define STRIP 256   /* numbers at a time */
 
 const dar_bundle_family_info dar_bundle_table[DAR_BUNDLE_FAMILIES] = {
     [DAR_FAMILY_TRACKING] = { "tracking", "tracking", 3 },
@@ -149,24 +150,20 @@ struct decoding {
     float *y;
 };
 
-static double number_at(const dar_plane *p, size_t i)
-{
-    switch (p->type) {
-    case DAR_PLANE_U8: return ((const uint8_t *)p->data)[i];
-    case DAR_PLANE_U16: return ((const uint16_t *)p->data)[i];
-    case DAR_PLANE_I16: return ((const int16_t *)p->data)[i];
-    default: return (double)((const float *)p->data)[i];
-    }
-}
-
 static void decode_range(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct decoding *j = ctx;
+    double x[STRIP];
     (void)thread;
-    for (size_t i = begin; i < end; i++) {
-        size_t c = i / j->pixels;
-        double v = j->plane->scale[c] * number_at(j->plane, i) + j->plane->offset[c];
-        j->y[i] = !j->cover || j->cover[i % j->pixels] ? (float)v : 0;
+    while (begin < end) {
+        size_t c = begin / j->pixels, at = begin % j->pixels, n = j->pixels - at;
+        if (n > end - begin) n = end - begin;
+        if (n > STRIP) n = STRIP;
+        const double scale = j->plane->scale[c], offset = j->plane->offset[c];
+        dar_plane_numbers(j->plane, begin, n, x);
+        for (size_t i = 0; i < n; i++) j->y[begin + i] = (float)(scale * x[i] + offset);
+        for (size_t i = 0; i < n && j->cover; i++) j->y[begin + i] = j->cover[at + i] ? j->y[begin + i] : 0;
+        begin += n;
     }
 }
 
@@ -178,5 +175,10 @@ void dar_bundle_decode(const dar_plane *p, size_t channels, const uint8_t *cover
 
 void dar_bundle_cover(const dar_plane *p, size_t pixels, uint8_t *cover)
 {
-    for (size_t i = 0; i < pixels; i++) cover[i] = p->scale[0] * number_at(p, i) + p->offset[0] > 0 ? 255 : 0;
+    double x[STRIP];
+    for (size_t at = 0; at < pixels; at += STRIP) {
+        size_t n = pixels - at < STRIP ? pixels - at : STRIP;
+        dar_plane_numbers(p, at, n, x);
+        for (size_t i = 0; i < n; i++) cover[at + i] = p->scale[0] * x[i] + p->offset[0] > 0 ? 255 : 0;
+    }
 }

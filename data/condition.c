@@ -175,7 +175,7 @@ typedef struct job {
     float *y;             /* [channels, pixels], channels `stride` apart */
 } job;
 
-static void numbers(const dar_plane *p, size_t at, size_t n, double *x)
+void dar_plane_numbers(const dar_plane *p, size_t at, size_t n, double *x)
 {
     switch (p->type) {
     case DAR_PLANE_U8:
@@ -216,7 +216,7 @@ static void enter_planes(void *ctx, size_t begin, size_t end, int thread)
     (void)thread;
     for (size_t at = begin; at < end; at += STRIP) {
         size_t n = end - at < STRIP ? end - at : STRIP;
-        for (size_t c = 0; c < b->channels; c++) numbers(&b->plane, c * b->pixels + at, n, x[c]);
+        for (size_t c = 0; c < b->channels; c++) dar_plane_numbers(&b->plane, c * b->pixels + at, n, x[c]);
         for (size_t c = 0; c < b->channels; c++) {
             const double *m = b->m + 4 * c;
             if (b->channels == 1)
@@ -235,7 +235,7 @@ static void enter_cover(void *ctx, size_t begin, size_t end, int thread)
     (void)thread;
     for (size_t at = begin; at < end; at += STRIP) {
         size_t n = end - at < STRIP ? end - at : STRIP;
-        numbers(&b->plane, at, n, x);
+        dar_plane_numbers(&b->plane, at, n, x);
         for (size_t i = 0; i < n; i++) {
             b->cover[at + i] = b->plane.scale[0] * x[i] + b->plane.offset[0] > 0;
             b->count[at + i] = (unsigned char)(b->cover[at + i] + (b->how == SET ? 0 : b->count[at + i]));

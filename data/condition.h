@@ -115,6 +115,9 @@ typedef struct dar_plane {
     double scale[3], offset[3];
 } dar_plane;
 
+/* Numbers [at, at + n) of a plane. */
+void dar_plane_numbers(const dar_plane *p, size_t at, size_t n, double *x);
+
 typedef dar_status dar_plane_read(void *ctx, dar_family family, size_t frame, dar_plane *plane, dar_err *e);
 
 typedef struct dar_condition_source {
