@@ -109,7 +109,11 @@ static const bench_kind blocks = {
 const bench_row bench_net_rows[] = {
     { &blocks, DAR_F32, { 8, 1536, 64, 384, 6, 1536 }, BENCH_F32, { 0 }, false },
     { &blocks, DAR_BF16, { 8, 1536, 64, 384, 6, 1536 }, BENCH_BF16, { 0 }, false },
+    { &blocks, DAR_F32, { 2, 2048, 512, 1536, 12, 8960 }, BENCH_F32, { 0 }, false },
+    { &blocks, DAR_BF16, { 2, 2048, 512, 1536, 12, 8960 }, BENCH_BF16, { 0 }, false },
     { &blocks, DAR_F32, { 1, 2048, 512, 3072, 24, 14336 }, BENCH_F32, { 0 }, false },
     { &blocks, DAR_BF16, { 1, 2048, 512, 3072, 24, 14336 }, BENCH_BF16, { 0 }, false },
+    { &blocks, DAR_F32, { 1, 8192, 512, 3072, 24, 14336 }, BENCH_F32, { 0 }, false },
+    { &blocks, DAR_BF16, { 1, 8192, 512, 3072, 24, 14336 }, BENCH_BF16, { 0 }, false },
 };
 const size_t bench_n_net_rows = DAR_COUNT(bench_net_rows);

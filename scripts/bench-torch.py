@@ -1,0 +1,176 @@
+#!/usr/bin/env python3
+"""bench-torch.py [TEXT]: whole blocks of the transformer side by side with PyTorch on this processor.
+
+    pip install torch==2.13.0
+    make build/release/bench_kernels
+
+Each case runs in turn as `bench_kernels --filter=...` and in PyTorch, eager and compiled, with as many threads: forward
+alone, and a training step of rank-32 LoRA (forward, mean square, backward; nothing recomputed, no optimiser).  PyTorch
+gets what it likes best: fused attention, huge pages for its memory, the instructions that it finds by itself.  Prints
+medians and ratios as a Markdown table; TEXT selects cases that contain it.
+"""
+import csv
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+
+# name: blocks, tokens (frames of 16 x 16), text tokens, width, heads, feed-forward width
+CASES = {
+    "8 x 384": (8, 1536, 64, 384, 6, 1536),
+    "2 x 1536": (2, 2048, 512, 1536, 12, 8960),
+    "1 x 3072": (1, 2048, 512, 3072, 24, 14336),
+    "1 x 3072 long": (1, 8192, 512, 3072, 24, 14336),
+}
+RANK = 32
+THREADS = os.cpu_count()
+
+
+def torch_case(size, dtype, compiled):
+    """Median seconds of forward and step, peak memory [bytes] above an empty process."""
+    import resource
+
+    import torch
+    import torch.nn as nn
+    import torch.nn.functional as F
+
+    start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    torch.set_num_threads(THREADS)
+    torch.manual_seed(0)
+    blocks, tokens, text, D, heads, ffn = size
+    E, storage = D // heads, {"f32": torch.float32, "bf16": torch.bfloat16}[dtype]
+
+    class Product(nn.Module):
+        def __init__(self, n_in, n_out):
+            super().__init__()
+            self.base = nn.Linear(n_in, n_out).to(storage).requires_grad_(False)
+            self.down = nn.Parameter(torch.randn(RANK, n_in).mul(0.02).to(storage))
+            self.up = nn.Parameter(torch.randn(n_out, RANK).mul(0.02).to(storage))
+
+        def forward(self, x):
+            y = self.base(x)
+            return y + F.linear(F.linear(x, self.down), self.up) if torch.is_grad_enabled() else y
+
+    def rms(x, w):
+        f = x.float()
+        return (f * torch.rsqrt(f.square().mean(-1, keepdim=True) + 1e-6)).to(x.dtype) * w
+
+    angle = torch.rand(tokens, 1, E // 2)
+    cos, sin = angle.cos(), angle.sin()
+
+    def rope(x):  # [B, N, A, E]
+        a, b = x.float().unflatten(-1, (-1, 2)).unbind(-1)
+        return torch.stack((a * cos - b * sin, a * sin + b * cos), -1).flatten(-2).to(x.dtype)
+
+    class Attention(nn.Module):
+        def __init__(self, own):
+            super().__init__()
+            self.q, self.k, self.v, self.o = (Product(D, D) for _ in range(4))
+            self.w = nn.ParameterList([nn.Parameter(torch.ones(D, dtype=storage), requires_grad=False)] * 2)
+            self.own = own
+
+        def forward(self, x, context):
+            q, k = rms(self.q(x), self.w[0]), rms(self.k(context), self.w[1])
+            q, k, v = (y.unflatten(-1, (heads, E)) for y in (q, k, self.v(context)))
+            if self.own:
+                q, k = rope(q), rope(k)
+            y = F.scaled_dot_product_attention(*(y.transpose(1, 2) for y in (q, k, v)))
+            return self.o(y.transpose(1, 2).flatten(2))
+
+    class Block(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.own, self.cross = Attention(True), Attention(False)
+            self.up, self.down = Product(D, ffn), Product(ffn, D)
+            self.modulation = nn.Parameter(torch.randn(1, 6, 1, D) / D**0.5, requires_grad=False)
+
+        def forward(self, x, context, e):  # x f32
+            shift, scale, gate, shift2, scale2, gate2 = (self.modulation + e).unbind(1)
+            h = (F.layer_norm(x, (D,), eps=1e-6) * (1 + scale) + shift).to(storage)
+            x = x + self.own(h, h).float() * gate
+            x = x + self.cross(F.layer_norm(x, (D,), eps=1e-6).to(storage), context).float()
+            h = (F.layer_norm(x, (D,), eps=1e-6) * (1 + scale2) + shift2).to(storage)
+            return x + self.down(F.gelu(self.up(h), approximate="tanh")).float() * gate2
+
+    net = nn.ModuleList(Block() for _ in range(blocks))
+    x, target = torch.randn(1, tokens, D), torch.randn(1, tokens, D)
+    context, e = torch.randn(1, text, D).to(storage), torch.randn(1, 6, 1, D) * 0.1
+
+    def run(h):
+        for b in net:
+            h = b(h, context, e)
+        return h
+
+    if compiled:
+        run = torch.compile(run)
+
+    def forward():
+        with torch.no_grad():
+            run(x)
+
+    def step():
+        F.mse_loss(run(x), target).backward()
+        for p in net.parameters():
+            p.grad = None
+
+    out = []
+    for fn in (forward, step):
+        fn()
+        seconds, begin = [], time.time()
+        while len(seconds) < 2 or (time.time() - begin < 10 and len(seconds) < 9):
+            t = time.perf_counter()
+            fn()
+            seconds.append(time.perf_counter() - t)
+        out.append(statistics.median(seconds))
+    return out + [1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start)]
+
+
+def run_torch(size, dtype, compiled):
+    env = dict(os.environ, GLIBC_TUNABLES="glibc.malloc.hugetlb=1:glibc.malloc.mmap_max=0",
+               OMP_NUM_THREADS=str(THREADS), OMP_PROC_BIND="true", OMP_PLACES="threads")
+    code = subprocess.run([sys.executable, __file__, "--torch", json.dumps([size, dtype, compiled])], env=env,
+                          capture_output=True, text=True)
+    if code.returncode:
+        return None
+    return json.loads(code.stdout.splitlines()[-1])
+
+
+def run_ours(size, dtype):
+    shape = "x".join(map(str, size))
+    env = {k: v for k, v in os.environ.items() if not k.startswith("OPENBLAS_")}
+    env |= {"OMP_PROC_BIND": "true", "OMP_PLACES": "threads"}
+    path = "build/bench/torch.csv"
+    os.makedirs("build/bench", exist_ok=True)
+    subprocess.run(["build/release/bench_kernels", f"--output={path}", f"--filter=blocks {dtype} {shape}"], env=env,
+                   check=True, stdout=subprocess.DEVNULL)
+    found = {}
+    with open(path) as f:
+        for row in csv.DictReader(f):
+            if row["kernel"].startswith("blocks") and int(row["threads"]) == THREADS:
+                found[row["kernel"]] = (float(row["median_s"]), float(row["fraction_of_peak"]))
+    return found["blocks"], found["blocks_step"]
+
+
+def main():
+    if sys.argv[1:2] == ["--torch"]:
+        print(json.dumps(torch_case(*json.loads(sys.argv[2]))))
+        return
+    print("| blocks x width, tokens | type | pass | here [s] | of peak | PyTorch eager [s] | compiled [s] | ratio |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name, size in CASES.items():
+        for dtype in ("f32", "bf16"):
+            if not all(t in f"{name} {dtype}" for t in sys.argv[1:]):
+                continue
+            ours = run_ours(size, dtype)
+            eager, fused = run_torch(size, dtype, False), run_torch(size, dtype, True)
+            for i, what in enumerate(("forward", "LoRA step")):
+                theirs = [t[i] if t else float("nan") for t in (eager, fused)]
+                best = min(t for t in theirs if t == t)
+                print(f"| {name.replace(' long', '')}, {size[1]} | {dtype} | {what} | "
+                      f"{ours[i][0]:.3f} | {ours[i][1]:.2f} | {theirs[0]:.3f} | {theirs[1]:.3f} | "
+                      f"{best / ours[i][0]:.2f} |", flush=True)
+
+
+main()
