@@ -93,6 +93,7 @@ static void push_inside(struct dar_raster_inside *in, const dar_raster *r, dar_a
     in->start = push(a, tiles + 1, sizeof *in->start);
     in->next = push(a, tiles, DAR_RASTER_GROUPS * sizeof *in->next);
     in->used = push(a, tiles, sizeof *in->used);
+    in->zero = push(a, tiles, sizeof *in->zero);
     in->nearest = push(a, tiles, DAR_TILE_PIXELS * sizeof *in->nearest);
     in->shown = push(a, tiles, DAR_TILE_PIXELS * sizeof *in->shown);
     in->spent = push(a, tiles, sizeof *in->spent);
@@ -148,6 +149,18 @@ static void copy_range(void *ctx, size_t begin, size_t end, int thread)
     const struct copy *c = ctx;
     (void)thread;
     memcpy(c->to + begin, c->from + begin, end - begin);
+}
+
+/* Whether `out` is `last`, family by family: what was empty there is zero already. */
+static bool same_buffers(const dar_gbuffer *out, const dar_gbuffer *last)
+{
+    struct family to[FAMILIES], from[FAMILIES];
+    if (!last) return false;
+    families_of(out, to);
+    families_of(last, from);
+    for (int i = 0; i < FAMILIES; i++)
+        if (to[i].data && to[i].data != from[i].data) return false;
+    return true;
 }
 
 /* Whether `last` has what `out` asks for. */
@@ -279,6 +292,7 @@ void dar_raster_draw(dar_raster *r, const dar_pose *p, const dar_view *v, const 
     dar_raster_cull(r, p);
     seconds[DAR_STAGE_CULL] += lap(&mark);
     draw_rounds(r, p, out, &mark);
+    if (!in->drawn || !same_buffers(out, last)) memset(in->zero, 0, in->tiles_x * in->tiles_y * sizeof *in->zero);
     dar_raster_fill(r, out);
     seconds[DAR_STAGE_FILL] += lap(&mark);
     in->drawn = true;

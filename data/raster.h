@@ -115,7 +115,8 @@ void dar_raster_init(dar_raster *r, const dar_scene *s, const dar_identity *iden
                      dar_arena *a);
 
 /* Draw the pose, which must have been set once, and only once, since the draw before.  `last`: what the draw before
- * made, in the same families; if nothing has moved since, it is copied.  NULL: not at hand.
+ * made, in the same families; if nothing has moved since, it is copied.  It may be `out` itself: then tiles that were
+ * empty and are again are not written.  NULL: not at hand.
  * Aborts if the view has another size than the config, or near or focal lengths beyond the limits above. */
 void dar_raster_draw(dar_raster *r, const dar_pose *p, const dar_view *v, const dar_gbuffer *out,
                      const dar_gbuffer *last);

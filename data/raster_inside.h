@@ -55,6 +55,7 @@ struct dar_raster_inside {
     size_t group[DAR_RASTER_GROUPS + 1]; /* first piece of each group */
     size_t tiles_x, tiles_y;
     bool *used;              /* [tiles] drawn into in this frame */
+    bool *zero;              /* [tiles] empty in what was drawn last */
     double *nearest;         /* [tiles, DAR_TILE_PIXELS] 1 / depth */
     double *shown;           /* [tiles, DAR_TILE_PIXELS] id, exact; f64 so that both are selected by one mask */
     double (*spent)[2];      /* [tiles] seconds of cover and resolve */

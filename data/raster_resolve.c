@@ -175,24 +175,26 @@ void dar_raster_resolve(const dar_raster *r, const dar_pose *p, const dar_gbuffe
     }
 }
 
-/* Runs of empty tiles in one row of tiles. */
+/* Runs of empty tiles in one row of tiles, but those that are zero already. */
 static void fill_row(void *ctx, size_t row, int thread)
 {
     const struct job *j = ctx;
     const struct dar_raster_inside *in = j->r->in;
     const bool *used = in->used + row * in->tiles_x;
+    bool *zero = in->zero + row * in->tiles_x;
     size_t width = (size_t)j->r->config.width, height = (size_t)j->r->config.height;
     size_t top = row * DAR_TILE_HEIGHT, bottom = dar_least(top + DAR_TILE_HEIGHT, height);
     (void)thread;
 
     for (size_t a = 0, b; a < in->tiles_x; a = b + 1) {
-        for (b = a; b < in->tiles_x && !used[b];) b++;
+        for (b = a; b < in->tiles_x && !used[b] && !zero[b];) b++;
         if (a == b) continue;
         size_t left = a * DAR_TILE_WIDTH, n = dar_least(b * DAR_TILE_WIDTH, width) - left;
         if (n == width) clear_row(j->r, j->out, top * width, (bottom - top) * width);
         else
             for (size_t y = top; y < bottom; y++) clear_row(j->r, j->out, y * width + left, n);
     }
+    for (size_t i = 0; i < in->tiles_x; i++) zero[i] = !used[i];
 }
 
 void dar_raster_fill(const dar_raster *r, const dar_gbuffer *out)
