@@ -45,6 +45,7 @@ SRC   := $(filter-out $(MAINS),$(wildcard $(addsuffix /*.c,$(ROOMS))))
 OBJ   := $(SRC:%.c=$B/%.o)
 TESTS := $(patsubst tests/%.c,%,$(wildcard tests/test_*.c))
 BENCH := $(patsubst %.c,$B/%.o,$(wildcard tests/bench_*.c))
+SPEED := $(patsubst tests/%.c,%,$(wildcard tests/speed_*.c))
 FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
@@ -124,12 +125,16 @@ bench-kernels: deps ## speed of every kernel as a fraction of the machine's peak
 		$B/bench_kernels --output=build/bench/kernels.csv \
 		$(if $(QUICK),--quick) $(if $(FILTER),'--filter=$(FILTER)') $(if $(CPU),--cpu-mask=$(CPU))
 
-$B/speed_dit: $B/tests/bench_peak.o
-$B/speed_%: $B/tests/speed_%.o $B/libdar.a
+$B/speed_%: $B/tests/speed_%.o $B/tests/bench_peak.o $B/libdar.a
 	@echo "LD $@"
 	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
 
-everything: all $(TESTS:%=$B/%) $B/bench_kernels $B/speed_raster $B/speed_bundle $B/speed_dit $B/ulp
+bench: deps ## speed of whole tasks, stage by stage: build/bench/data.csv
+	@$(MAKE) --no-print-directory $B/speed_data
+	@mkdir -p build/bench
+	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_data --output=build/bench/data.csv
+
+everything: all $(TESTS:%=$B/%) $B/bench_kernels $(SPEED:%=$B/%) $B/ulp
 
 headers: $(HDR:%=alone/%)
 
