@@ -497,6 +497,28 @@ static void atomic(void **state)
     CHECK(is_there(in_dir("once/thesis.txt")) && entries(dir) == before + 1, "what is left of a refused writer");
 }
 
+/* What came to the target's place while a bundle was written is not replaced unasked, be it empty. */
+static void race(void **state)
+{
+    (void)state;
+    dar_bundle_options o = all();
+    dar_bundle_meta m = meta_of(&made);
+    dar_bundle_writer *w[2];
+    dar_err e;
+    for (int i = 0; i < 2; i++) ok(dar_bundle_create(&w[i], in_dir("race"), &m, &made.cameras, &o, &e), &e);
+    for (int i = 0; i < 2; i++)
+        for (size_t t = 0; t < T; t++) {
+            dar_bundle_frame f = frame_of(&made, t);
+            ok(dar_bundle_add(w[i], &f, &e), &e);
+        }
+    CHECK(mkdir(in_dir("race"), 0777) == 0, "mkdir");
+    refused(dar_bundle_commit(w[0], &e), &e, "race: is there already");
+    CHECK(rmdir(in_dir("race")) == 0, "an empty directory was replaced");
+    ok(dar_bundle_commit(w[1], &e), &e);
+    for (int i = 0; i < 2; i++) dar_bundle_discard(w[i]);
+    CHECK(is_there(in_dir("race/meta.json")), "the winner's bundle is gone");
+}
+
 /* A directory that nobody holds locked is what a killed writer leaves. */
 static void leftovers(void **state)
 {
@@ -735,10 +757,11 @@ static int tear_down(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(round_trip),  cmocka_unit_test(same_bytes), cmocka_unit_test(condition),
-        cmocka_unit_test(of_others),   cmocka_unit_test(lies),       cmocka_unit_test(atomic),
-        cmocka_unit_test(leftovers),   cmocka_unit_test(killed),     cmocka_unit_test(damaged),
-        cmocka_unit_test(not_numbers), cmocka_unit_test(exr),        cmocka_unit_test(blender),
+        cmocka_unit_test(round_trip), cmocka_unit_test(same_bytes),  cmocka_unit_test(condition),
+        cmocka_unit_test(of_others),  cmocka_unit_test(lies),        cmocka_unit_test(atomic),
+        cmocka_unit_test(race),       cmocka_unit_test(leftovers),   cmocka_unit_test(killed),
+        cmocka_unit_test(damaged),    cmocka_unit_test(not_numbers), cmocka_unit_test(exr),
+        cmocka_unit_test(blender),
     };
     if (argc == 4 && strcmp(argv[1], "write") == 0) return write_and_die(argv[2], argv[3]);
     return cmocka_run_group_tests(tests, set_up, tear_down) != 0;
