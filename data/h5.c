@@ -4,6 +4,7 @@
  * makes it read past the end. */
 #include "data/h5.h"
 
+#include <errno.h>
 #include <hdf5.h>
 #include <inttypes.h>
 #include <stdio.h>
@@ -51,26 +52,39 @@ static hid_t stored_type(dar_h5_type type)
 
 /* ---------------------------------------------------------------- errors */
 
-/* HDF5 keeps this per thread, so every entry says it again. */
+/* HDF5 keeps this per thread, so every entry says it again.  At exit it would visit files that it could not close, a
+ * full disk for example, and crash: it is not asked to tidy up there. */
 static void silence(void)
 {
+    H5dont_atexit();
     H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
     H5Eclear2(H5E_DEFAULT);
 }
 
+struct cause {
+    char text[160];
+    int error; /* errno, if the system refused; else 0 */
+};
+
 /* The innermost entry of HDF5's stack is the cause. */
 static herr_t first_cause(unsigned n, const H5E_error2_t *x, void *to)
 {
-    if (n == 0) snprintf(to, 160, "%s", x->desc ? x->desc : "no reason given");
+    struct cause *c = to;
+    if (n || !x->desc) return 0;
+    const char *error = strstr(x->desc, "errno = ");
+    snprintf(c->text, sizeof c->text, "%s", x->desc);
+    if (error) c->error = (int)strtol(error + strlen("errno = "), NULL, 10);
     return 0;
 }
 
 static dar_status refused(const dar_h5 *f, const char *name, const char *what, dar_err *e)
 {
-    char why[160] = "no reason given";
-    H5Ewalk2(H5E_DEFAULT, H5E_WALK_UPWARD, first_cause, why);
+    struct cause why = { "no reason given", 0 };
+    H5Ewalk2(H5E_DEFAULT, H5E_WALK_UPWARD, first_cause, &why);
+    bool full = why.error == ENOSPC || why.error == EDQUOT || why.error == EFBIG;
+    if (f->writing && full) return dar_fail(e, DAR_ERR_NOMEM, "%s: %s", f->path, strerror(why.error));
     return dar_fail(e, f->writing ? DAR_ERR_IO : DAR_ERR_FORMAT, "%s: %s%s%s: HDF5: %s", f->path, name,
-                    *name ? ": " : "", what, why);
+                    *name ? ": " : "", what, why.text);
 }
 
 /* ---------------------------------------------------------------- files */

@@ -7,6 +7,7 @@
 #include <ftw.h>
 #include <signal.h>
 #include <spawn.h>
+#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/wait.h>
 #include <time.h>
@@ -482,6 +483,24 @@ static void interrupted(void **state)
     CHECK(one_line(ran.err) && strstr(ran.err, "interrupted after "), "%s", ran.err);
 }
 
+/* Files may not grow beyond 16 kB: as on a full disk, writing fails half way. */
+static void full_disk(void **state)
+{
+    (void)state;
+    struct rlimit old, small;
+    assert_int_equal(getrlimit(RLIMIT_FSIZE, &old), 0);
+    small = old;
+    small.rlim_cur = 1 << 14;
+    void (*handler)(int) = signal(SIGXFSZ, SIG_IGN); /* the child inherits both */
+    assert_int_equal(setrlimit(RLIMIT_FSIZE, &small), 0);
+    pid_t pid = start((const char *const[]){ "render", "scene.glb", "-o", "full", NULL });
+    assert_int_equal(setrlimit(RLIMIT_FSIZE, &old), 0);
+    signal(SIGXFSZ, handler);
+    CHECK(finish(pid) == 3, "status %d: %s", ran.status, ran.err);
+    CHECK(one_line(ran.err) && strstr(ran.err, "File too large"), "%s", ran.err);
+    CHECK(count(".", "full") == 0, "something is left");
+}
+
 /* ---------------------------------------------------------------- */
 
 static int in_directory(void **state)
@@ -510,6 +529,7 @@ int main(int argc, char **argv)
         cmocka_unit_test(refusals),
         cmocka_unit_test(killed),
         cmocka_unit_test(interrupted),
+        cmocka_unit_test(full_disk),
     };
     char own[PATH_MAX];
     if (argc < 1 || !realpath(argv[0], own)) return 2;
