@@ -63,6 +63,18 @@ void dar_tape_clear(dar_tape *t)
     *t = fresh;
 }
 
+dar_tape_place dar_tape_mark(const dar_tape *t)
+{
+    return (dar_tape_place){ dar_arena_mark(t->arena), dar_arena_mark(&t->meta) };
+}
+
+void dar_tape_reset(dar_tape *t, dar_tape_place p)
+{
+    DAR_ASSERT((unsigned char *)t->last < t->meta.base + p.meta, "tape: a reset of what is recorded");
+    dar_arena_reset(t->arena, p.arena);
+    dar_arena_reset(&t->meta, p.meta);
+}
+
 void *dar_tape_room(dar_tape *t, size_t bytes)
 {
     return memset(dar_arena_push(&t->meta, bytes), 0, bytes);

@@ -65,6 +65,13 @@ void dar_tape_free(dar_tape *t);
 /* Forget nodes and values, spare buffers, cost and bad_op.  The arenas `arena` and `keep` are the caller's to reset. */
 void dar_tape_clear(dar_tape *t);
 
+/* Where a tape stands, and back there: everything made since is gone.  Nothing of it may be recorded. */
+typedef struct dar_tape_place {
+    dar_mark arena, meta;
+} dar_tape_place;
+dar_tape_place dar_tape_mark(const dar_tape *t);
+void dar_tape_reset(dar_tape *t, dar_tape_place p);
+
 /* A value over memory of the caller, pushed on the arena.  g: gradient memory of the arithmetic type and x's shape that
  * backward adds to, or NULL for a frozen input. */
 dar_val *dar_leaf(dar_tape *t, dar_tensor x, const dar_tensor *g);

@@ -34,7 +34,7 @@ dar_val *dar_double_forward(dar_tape *t, const dar_double *f, dar_val *b, dar_va
 {
     const int64_t *d = x->x.shape.d;
     dar_val *y = dar_input(t, x->x.dtype, DAR_SHAPE(d[0], f->w[0].shape.d[0], d[2], 2 * d[3], 2 * d[4]));
-    dar_mark m = dar_arena_mark(t->arena);
+    dar_tape_place m = dar_tape_mark(t);
     for (int k = 0; k < 4; k++) {
         int row = k / 2, column = k % 2;
         dar_conv_attr a = { .stride = 1, .top = !row, .bottom = row, .left = !column, .right = column };
@@ -45,7 +45,7 @@ dar_val *dar_double_forward(dar_tape *t, const dar_double *f, dar_val *b, dar_va
         to.stride[3] *= 2;
         to.stride[4] *= 2;
         if (!t->arena->plan) dar_tensor_copy(&to, &part->x);
-        dar_arena_reset(t->arena, m);
+        dar_tape_reset(t, m);
     }
     return y;
 }

@@ -287,16 +287,16 @@ dar_status dar_taew_decode_next(dar_taew_stream *s, dar_tape *t, dar_val *z, dar
     dar_status status = DAR_OK;
     DAR_ASSERT(s->side == DAR_VAE_DECODER && z->x.shape.d[2] == 1, "taew: a stream of the encoder, or %lld frames",
                (long long)z->x.shape.d[2]);
-    dar_mark begin = dar_arena_mark(t->arena);
+    dar_tape_place begin = dar_tape_mark(t);
     dar_val *x = make_frames(t, &p, z);
     int64_t frames = x->x.shape.d[2], first = s->pieces ? GROUP * s->pieces - DROP : 0;
     for (int64_t f = 0; f < frames && status == DAR_OK; f++) {
-        dar_mark m = dar_arena_mark(t->arena);
+        dar_tape_place m = dar_tape_mark(t);
         dar_val *y = finish_frames(t, &p, dar_slice(t, x, 2, f, 1));
         if (sink) status = sink(ctx, &y->x, first + f, e);
-        dar_arena_reset(t->arena, m);
+        dar_tape_reset(t, m);
     }
-    dar_arena_reset(t->arena, begin);
+    dar_tape_reset(t, begin);
     s->pieces++;
     return status;
 }

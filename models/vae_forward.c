@@ -336,21 +336,21 @@ dar_status dar_vae_decode_next(dar_vae_stream *s, dar_tape *t, dar_val *z, dar_v
     for (int i = 0; i < v->c.levels; i++)
         if (v->decoder.level[i].halve_time) last = i + 1;
 
-    dar_mark begin = dar_arena_mark(t->arena);
+    dar_tape_place begin = dar_tape_mark(t);
     dar_val *x = decoder_begin(t, &p, z);
     for (int i = 0; i < last; i++) x = up_level(t, &p, &v->decoder.level[i], x);
     int64_t frames = frames_of(x), first = s->pieces ? 1 + (s->pieces - 1) * dar_vae_shrink_time(&v->c) : 0;
     dar_status status = DAR_OK;
     for (int64_t f = 0; f < frames && status == DAR_OK; f++) {
-        dar_mark m = dar_arena_mark(t->arena);
+        dar_tape_place m = dar_tape_mark(t);
         dar_val *y = dar_contiguous(t, dar_slice(t, x, 2, f, 1));
         for (int i = last; i < v->c.levels; i++) y = up_level(t, &p, &v->decoder.level[i], y);
         y = decoder_end(t, &p, y);
         if (!t->arena->plan) dar_vae_clamp(&y->x);
         if (sink) status = sink(ctx, &y->x, first + f, e);
-        dar_arena_reset(t->arena, m);
+        dar_tape_reset(t, m);
     }
-    dar_arena_reset(t->arena, begin);
+    dar_tape_reset(t, begin);
     s->pieces++;
     return status;
 }
