@@ -74,8 +74,8 @@ struct bench {
 const char *bench_blas_core(void);
 
 /* The tables. */
-extern const bench_row bench_product_rows[], bench_op_rows[], bench_row_rows[], bench_net_rows[];
-extern const size_t bench_n_product_rows, bench_n_op_rows, bench_n_row_rows, bench_n_net_rows;
+extern const bench_row bench_product_rows[], bench_op_rows[], bench_row_rows[], bench_net_rows[], bench_vae_rows[];
+extern const size_t bench_n_product_rows, bench_n_op_rows, bench_n_row_rows, bench_n_net_rows, bench_n_vae_rows;
 
 /* ---------------------------------------------------------------- help for kinds */
 
