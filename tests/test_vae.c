@@ -4,6 +4,7 @@
 #include "lib/kern.h"
 #include "lib/rng.h"
 #include "lib/weights.h"
+#include "models/tiles.h"
 #include "models/vae.h"
 
 typedef struct net {
@@ -38,7 +39,7 @@ static void net_init(net *n, dar_dtype storage, bool train)
     dar_err e;
     memset(n, 0, sizeof *n);
     CHECK(dar_config_open(&n->c, "models/presets/dar-test.json", &e) == DAR_OK, "%s", e.text);
-    CHECK(dar_arena_init(&n->weights, "weights", 16 << 20, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_arena_init(&n->weights, "weights", 64 << 20, &e) == DAR_OK, "%s", e.text);
     CHECK(dar_arena_init(&n->step, "step", 256 << 20, &e) == DAR_OK, "%s", e.text);
     CHECK(dar_arena_init(&n->cache, "cache", 64 << 20, &e) == DAR_OK, "%s", e.text);
     CHECK(dar_tape_init(&n->tape, &n->step, &e) == DAR_OK, "%s", e.text);
@@ -300,38 +301,172 @@ static void same_bits(void **state)
     dar_weights_close(s);
 }
 
+/* ---------------------------------------------------------------- in tiles */
+
+static void tile_weights(void **state)
+{
+    (void)state;
+    static const struct {
+        dar_tiling o;
+        int64_t n, count, length;
+    } runs[] = {
+        { { 8, 0 }, 24, 3, 8 }, { { 8, 3 }, 24, 5, 8 },    { { 8, 7 }, 11, 4, 8 },   { { 8, 2 }, 8, 1, 8 },
+        { { 8, 2 }, 5, 1, 5 },  { { 34, 16 }, 52, 2, 34 }, { { 26, 6 }, 52, 3, 22 }, { { 26, 6 }, 30, 2, 18 }
+    };
+    for (size_t r = 0; r < DAR_COUNT(runs); r++) {
+        const dar_tiling *o = &runs[r].o;
+        int64_t n = runs[r].n, count = dar_tiles_count(o, n), length = dar_tiles_length(o, n), scale = 3;
+        double sum[256] = { 0 };
+        assert_int_equal(count, runs[r].count);
+        assert_int_equal(length, runs[r].length);
+        assert_int_equal(dar_tiles_start(o, n, 0), 0);
+        assert_int_equal(dar_tiles_start(o, n, count - 1), n - length);
+        for (int64_t i = 0; i < count; i++) {
+            int64_t start = dar_tiles_start(o, n, i);
+            if (i) assert_true(start - dar_tiles_start(o, n, i - 1) <= length - o->overlap);
+            for (int64_t x = 0; x < scale * length; x++) {
+                double w = dar_tiles_weight(o, n, i, scale, x);
+                CHECK(w > 0 && w <= 1, "weight %g", w);
+                sum[scale * start + x] += w;
+            }
+        }
+        for (int64_t x = 0; x < scale * n; x++) CHECK_NEAR("sum of weights", sum[x], 1, 1e-14);
+    }
+}
+
+/* Root of the mean square of the change, over that of the whole. */
+static double change(const dar_tensor *whole, const dar_tensor *tiled)
+{
+    double off = 0, all = 0;
+    for (size_t i = 0; i < dar_tensor_count(whole); i++) {
+        double x = dar_dtype_get(whole->dtype, whole->data, i), y = dar_dtype_get(tiled->dtype, tiled->data, i);
+        off += (x - y) * (x - y);
+        all += x * x;
+    }
+    return sqrt(off / all);
+}
+
+/* A clip of 5 frames, 4 x 40 latent pixels: its moments, and pixels of a latent, in tiles or (o NULL) whole. */
+static void run_tiles(net *n, const dar_tiling *o, dar_tensor *moments, dar_tensor *pixels)
+{
+    dar_tensor x = dar_tensor_push(&n->weights, n->p.main, DAR_SHAPE(1, 3, 5, 64, 640));
+    dar_tensor z = dar_tensor_push(&n->weights, n->p.main, DAR_SHAPE(1, 5, 2, 4, 40));
+    dar_rng_fill_uniform(&x, 1, 2, -1, 1);
+    dar_rng_fill_normal(&z, 3, 4, 1);
+    *pixels = dar_tensor_push(&n->weights, x.dtype, x.shape);
+    *moments = dar_tensor_push(&n->weights, z.dtype, DAR_SHAPE(1, 10, 2, 4, 40));
+    if (o) {
+        dar_tiles_encode(&n->tape, &n->v, o, &x, moments, &n->cache);
+        dar_tiles_decode(&n->tape, &n->v, o, &z, pixels, &n->cache);
+        assert_int_equal(n->step.used + n->cache.used + n->tape.meta.used, 0);
+    } else {
+        dar_tensor_copy(moments, &dar_vae_encode(&n->tape, &n->v, input(n, &x))->x);
+        dar_tensor_copy(pixels, &dar_vae_decode(&n->tape, &n->v, input(n, &z))->x);
+        dar_vae_clamp(pixels);
+        dar_tape_clear(&n->tape);
+        dar_arena_reset(&n->step, 0);
+    }
+}
+
+/* One tile changes nothing.  Of several, the change shrinks as they overlap more; that of decoded pixels goes on being
+ * large with the attention, which sees its tile alone. */
+static void tiles_of_a_picture(void **state)
+{
+    (void)state;
+    static const dar_tiling o[] = { { 40, 0 }, { 20, 0 }, { 20, 10 }, { 20, 15 } };
+    double d[2][DAR_COUNT(o)][2];
+    for (int blind = 0; blind < 2; blind++) {
+        net n;
+        dar_tensor whole[2], tiled[2];
+        net_init(&n, DAR_F32, false);
+        n.tape.recording = false;
+        if (blind) dar_tensor_fill(&n.v.encoder.proj.w->x, 0);
+        if (blind) dar_tensor_fill(&n.v.decoder.proj.w->x, 0);
+        run_tiles(&n, NULL, &whole[0], &whole[1]);
+        for (size_t i = 0; i < DAR_COUNT(o); i++) {
+            run_tiles(&n, &o[i], &tiled[0], &tiled[1]);
+            for (int k = 0; k < 2; k++) d[blind][i][k] = change(&whole[k], &tiled[k]);
+            printf("tiles of %lld, overlap %2lld%s: moments change by %.1e, pixels by %.1e\n", (long long)o[i].size,
+                   (long long)o[i].overlap, blind ? ", no attention" : "", d[blind][i][0], d[blind][i][1]);
+        }
+        for (int k = 0; k < 2; k++) {
+            CHECK_NEAR("one tile", d[blind][0][k], 0, 0);
+            CHECK(d[blind][2][k] < 0.5 * d[blind][1][k], "overlap 10: change of %d by %.1e", k, d[blind][2][k]);
+            CHECK(d[blind][3][k] < d[blind][2][k], "overlap 15: change of %d by %.1e", k, d[blind][3][k]);
+        }
+        net_free(&n);
+    }
+    CHECK(d[1][3][1] < 0.5 * d[0][3][1], "pixels change by %.1e without attention", d[1][3][1]);
+}
+
 /* ---------------------------------------------------------------- the real sizes */
 
+/* The public network, with its weights, on arenas that only count. */
+static void plan_init(net *n, dar_dtype storage)
+{
+    dar_err e;
+    memset(n, 0, sizeof *n);
+    CHECK(dar_config_open(&n->c, "models/presets/wan22-fun-5b.json", &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_arena_init_plan(&n->weights, "weights", &e), DAR_OK);
+    assert_int_equal(dar_arena_init_plan(&n->step, "step", &e), DAR_OK);
+    assert_int_equal(dar_arena_init_plan(&n->cache, "cache", &e), DAR_OK);
+    assert_int_equal(dar_tape_init(&n->tape, &n->step, &e), DAR_OK);
+    n->tape.recording = false;
+    dar_params_init(&n->p, &n->weights, storage);
+    dar_vae_init(&n->v, &n->p, &n->c.vae);
+    dar_params_fresh(&n->p, DAR_PARAM_ALL, 0);
+}
+
+/* Work of a clip: 597 and 113.5 TFLOP at 480 x 832 x 81. */
 static void real_sizes(void **state)
 {
     (void)state;
-    dar_config c;
-    dar_err e;
-    dar_arena a;
-    dar_params p;
-    dar_vae v;
-    dar_tape t;
-    CHECK(dar_config_open(&c, "models/presets/wan22-fun-5b.json", &e) == DAR_OK, "%s", e.text);
-    assert_int_equal(dar_vae_shrink(&c.vae), 16);
-    assert_int_equal(dar_vae_shrink_time(&c.vae), 4);
-    assert_int_equal(dar_arena_init_plan(&a, "plan", &e), DAR_OK);
-    assert_int_equal(dar_tape_init(&t, &a, &e), DAR_OK);
-    dar_params_init(&p, &a, DAR_F32);
-    dar_vae_init(&v, &p, &c.vae);
-    assert_int_equal(p.count, 196);
-    assert_int_equal(dar_params_count(&p, DAR_PARAM_ALL), 704688668);
-    dar_params_fresh(&p, DAR_PARAM_ALL, 0);
+    net n;
+    plan_init(&n, DAR_F32);
+    assert_int_equal(dar_vae_shrink(&n.c.vae), 16);
+    assert_int_equal(dar_vae_shrink_time(&n.c.vae), 4);
+    assert_int_equal(n.p.count, 196);
+    assert_int_equal(dar_params_count(&n.p, DAR_PARAM_ALL), 704688668);
 
-    /* Work of a clip: 597 and 113.5 TFLOP at 480 x 832 x 81. */
-    t.recording = false;
-    dar_vae_decode(&t, &v, dar_input(&t, DAR_F32, DAR_SHAPE(1, 48, 21, 30, 52)));
-    CHECK_NEAR("decoder [TFLOP]", t.cost.forward / 1e12, 597, 6);
-    dar_tape_clear(&t);
-    dar_vae_encode(&t, &v, dar_input(&t, DAR_F32, DAR_SHAPE(1, 3, 81, 480, 832)));
-    CHECK_NEAR("encoder [TFLOP]", t.cost.forward / 1e12, 113.5, 1.5);
-    dar_tape_free(&t);
-    dar_params_free(&p);
-    dar_arena_free(&a);
+    dar_vae_decode(&n.tape, &n.v, dar_input(&n.tape, DAR_F32, DAR_SHAPE(1, 48, 21, 30, 52)));
+    CHECK_NEAR("decoder [TFLOP]", n.tape.cost.forward / 1e12, 597, 6);
+    dar_tape_clear(&n.tape);
+    dar_vae_encode(&n.tape, &n.v, dar_input(&n.tape, DAR_F32, DAR_SHAPE(1, 3, 81, 480, 832)));
+    CHECK_NEAR("encoder [TFLOP]", n.tape.cost.forward / 1e12, 113.5, 1.5);
+    net_free(&n);
+}
+
+/* Peak of 9 frames of 480 x 832: weights, what is kept, a step. */
+static void plan_pieces(net *n, dar_vae_side side, const dar_tiling *o, double gb[3])
+{
+    dar_tensor x = dar_tensor_push(&n->step, DAR_F32, DAR_SHAPE(1, 3, 9, 480, 832));
+    dar_tensor z = dar_tensor_push(&n->step, DAR_F32, DAR_SHAPE(1, side == DAR_VAE_ENCODER ? 96 : 48, 3, 30, 52));
+    if (side == DAR_VAE_DECODER) dar_vae_fold(&n->v, &n->weights);
+    if (side == DAR_VAE_ENCODER) dar_tiles_encode(&n->tape, &n->v, o, &x, &z, &n->cache);
+    else dar_tiles_decode(&n->tape, &n->v, o, &z, &x, &n->cache);
+    gb[0] = 1e-9 * (double)n->weights.peak;
+    gb[1] = 1e-9 * (double)n->cache.peak;
+    gb[2] = 1e-9 * (double)n->step.peak;
+}
+
+static void planned_memory(void **state)
+{
+    (void)state;
+    static const char *const sides[] = { "encoding", "decoding" };
+    static const dar_dtype types[] = { DAR_F32, DAR_BF16 };
+    static const dar_tiling tilings[] = { { 52, 0 }, { 26, 6 } };
+    for (size_t i = 0; i < DAR_COUNT(types); i++)
+        for (int side = DAR_VAE_ENCODER; side <= DAR_VAE_DECODER; side++)
+            for (size_t k = 0; k < DAR_COUNT(tilings); k++) {
+                net n;
+                double gb[3];
+                plan_init(&n, types[i]);
+                plan_pieces(&n, (dar_vae_side)side, &tilings[k], gb);
+                printf("%s 9 frames of 480 x 832 in %s, tiles of %lld: weights %.2f, kept %.2f, step %.2f GB\n",
+                       sides[side], dar_dtype_name(types[i]), (long long)tilings[k].size, gb[0], gb[1], gb[2]);
+                CHECK(gb[0] + gb[1] + gb[2] < 20, "%.1f GB", gb[0] + gb[1] + gb[2]);
+                net_free(&n);
+            }
 }
 
 int main(void)
@@ -343,7 +478,10 @@ int main(void)
         cmocka_unit_test(encoding_in_pieces),
         cmocka_unit_test(causality),
         cmocka_unit_test(same_bits),
+        cmocka_unit_test(tile_weights),
+        cmocka_unit_test(tiles_of_a_picture),
         cmocka_unit_test(real_sizes),
+        cmocka_unit_test(planned_memory),
     };
     return cmocka_run_group_tests_name("vae", tests, NULL, NULL) != 0;
 }
