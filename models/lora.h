@@ -9,8 +9,9 @@
  *   blocks.0.self_attn.q.lora_A.weight, .lora_B.weight                              PEFT
  *   blocks.0.self_attn.q.lora_A.default.weight, .lora_B.default.weight              DiffSynth
  *
- * with diffusion_model., pipe.dit., transformer. or base_model.model. before them.  PEFT files do not say alpha:
- * whoever trained with alpha other than r must say so when reading, or the strength is wrong by that ratio.
+ * with diffusion_model., pipe.dit., transformer. or base_model.model. before them, and the products named as in the
+ * public checkpoint or as in diffusers (attn1.to_q).  PEFT files do not say alpha: whoever trained with alpha other
+ * than r must say so when reading, or the strength is wrong by that ratio.
  *
  * Source: Hu et al. 2021, eq. 3; forms as in the public tools. */
 #ifndef DAR_MODELS_LORA_H

@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "lib/safetensors_write.h"
+#include "models/load.h"
 
 /* ---------------------------------------------------------------- names */
 
@@ -22,13 +23,24 @@ static const char *after(const char *s, const char *what)
 
 static const char *skip_prefixes(const char *s)
 {
-    static const char *const prefix[] = { "lora_unet__", "diffusion_model.", "pipe.dit.", "transformer.",
-                                          "base_model.model." };
+    static const char *const prefix[] = { "lora_unet__", "lora_unet_",   "diffusion_model.",
+                                          "pipe.dit.",   "transformer.", "base_model.model." };
     for (size_t i = 0; i < DAR_COUNT(prefix); i++) {
         size_t n = strlen(prefix[i]);
         if (!strncmp(s, prefix[i], n)) return skip_prefixes(s + n);
     }
     return s;
+}
+
+/* What follows the name of a product, the public one or that of diffusers; NULL: s does not begin with it. */
+static const char *after_product(const char *s, int64_t block, int which)
+{
+    char own[DAR_PARAM_NAME], other[2 * DAR_PARAM_NAME];
+    snprintf(own, sizeof own, "blocks.%lld.%s.weight", (long long)block, dar_projection_names[which]);
+    dar_load_diffusers_dit(own, other, sizeof other);
+    own[strlen(own) - strlen(".weight")] = other[strlen(other) - strlen(".weight")] = 0;
+    const char *rest = after(s, own);
+    return rest ? rest : after(s, other);
 }
 
 bool dar_lora_parse(dar_lora_key *k, const char *name, int64_t layers)
@@ -45,14 +57,13 @@ bool dar_lora_parse(dar_lora_key *k, const char *name, int64_t layers)
         { ".lora_B.default.weight", DAR_LORA_UP },
         { ".alpha", DAR_LORA_ALPHA },
     };
-    const char *s = after(skip_prefixes(name), "blocks.");
-    char *end;
+    const char *s = skip_prefixes(name), *number = after(s, "blocks.");
 
-    if (!s || *s < '0' || *s > '9') return false;
-    k->block = strtol(s, &end, 10);
-    if (k->block >= layers || (*end != '.' && *end != '_')) return false;
+    if (!number || *number < '0' || *number > '9') return false;
+    k->block = strtol(number, NULL, 10);
+    if (k->block >= layers) return false;
     for (int i = 0; i < DAR_PROJECTIONS; i++) {
-        const char *rest = after(end + 1, dar_projection_names[i]);
+        const char *rest = after_product(s, k->block, i);
         if (!rest) continue;
         for (size_t j = 0; j < DAR_COUNT(suffix); j++) {
             if (strcmp(rest, suffix[j].text) != 0) continue;
