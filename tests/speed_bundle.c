@@ -2,18 +2,16 @@
  *
  *     speed_bundle [SCENE.glb [animation [width height frames [folder]]]]
  *
- * Three cameras on an orbit: the scene fills the picture, as it comes, far away.  Bundles lie in `folder` (standard:
- * build) and are removed. */
+ * Three cameras on an orbit: the scene fills the picture, as it comes, far away.  The last bundle stays in
+ * `folder`, build unless given. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <unistd.h>
 
 #include "data/bundle.h"
 #include "data/clip.h"
 #include "data/tracks.h"
-#include "lib/dir.h"
 #include "lib/log.h"
 #include "lib/thread.h"
 #include "tests/made.h"
