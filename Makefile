@@ -33,7 +33,7 @@ isa     = $(if $(filter %_avx2,$1),$(AVX2)) $(if $(filter %_avx512,$1),$(AVX512)
 # A fuzz target is called by the fuzzer under this one name; in a test, where all of them are linked, by its file's.
 alias   = $(if $(filter-out fuzz,$(MODE)),$(if $(filter tests/fuzz_%,$1),-DLLVMFuzzerTestOneInput=$(notdir $1)))
 
-ROOMS := lib autograd autograd/ops models data
+ROOMS := lib autograd autograd/ops models data train
 
 # A program dar-NAME is ROOM/dar_NAME.c with its main, ROOM/dar_NAME_*.c and the library.
 HALLS    := data train infer

@@ -4,6 +4,7 @@
     safetensors    reference.safetensors   pip install torch==2.13.0 safetensors numpy
     torch_rng      torch_rng.json          pip install torch==2.13.0 numpy; on a processor with AVX2
     torch_file     torch_*.pth             pip install torch==2.13.0
+    adamw          adamw.json              pip install torch==2.13.0
     solvers        solvers.json            pip install torch==2.13.0 diffusers==0.42.1
     h5             foreign.h5              pip install h5py==3.16.0 numpy
     corpus         ../corpus/              the files of torch_file
@@ -93,6 +94,32 @@ def torch_file():
     torch.save({"epoch": 3, "rates": [1e-4, 5e-5], "state_dict": model.state_dict()}, "tests/fixtures/torch_inner.pth")
     torch.save({"p": torch.nn.Parameter(x)}, "tests/fixtures/torch_parameter.pth")
     torch.save({"turned": x.t()}, "tests/fixtures/torch_strided.pth")
+
+
+def adamw():
+    """Ten steps of torch's AdamW in f64 with clipping and warm-up, for gradients w + step / 3 of two tensors."""
+    import json
+
+    import torch
+
+    wide = torch.float64
+    first = [torch.linspace(-1, 1, 6, dtype=wide).reshape(2, 3), torch.tensor([0.5, -0.25], dtype=wide)]
+    runs = []
+    for decay, max_norm, warmup in ((0.03, 0.05, 4), (0.0, 0.0, 0), (0.1, 3.0, 20)):
+        w = [x.clone().requires_grad_() for x in first]
+        o = torch.optim.AdamW(w, lr=1e-2, betas=(0.9, 0.999), eps=1e-10, weight_decay=decay)
+        run = {"decay": decay, "max_norm": max_norm, "warmup": warmup, "norms": [], "weights": []}
+        for k in range(10):
+            for x in w:
+                x.grad = x.detach() + k / 3
+            limit = max_norm if max_norm else float("inf")
+            run["norms"].append(torch.nn.utils.clip_grad_norm_(w, limit).item())
+            o.param_groups[0]["lr"] = 1e-2 * (min(1.0, k / warmup) if warmup else 1.0)
+            o.step()
+            run["weights"].append([v for x in w for v in x.flatten().tolist()])
+        runs.append(run)
+    with open("tests/fixtures/adamw.json", "w") as f:
+        json.dump(runs, f, indent=0)
 
 
 def solvers():
@@ -490,7 +517,7 @@ def image_files():
 
 
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (safetensors, torch_rng, torch_file, solvers, h5, corpus)}
+    known = {f.__name__: f for f in (safetensors, torch_rng, torch_file, adamw, solvers, h5, corpus)}
     if not sys.argv[1:] or any(name not in known for name in sys.argv[1:]):
         sys.exit(__doc__)
     for name in sys.argv[1:]:

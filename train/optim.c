@@ -1,0 +1,88 @@
+/* optim.c: see optim.h. */
+#include "train/optim.h"
+
+#include <math.h>
+
+#include "lib/kern.h"
+#include "lib/thread.h"
+
+#define CHUNK     ((size_t)64 * 1024) /* elements of a partial sum */
+#define CLIP_TINY 1e-6                /* keeps the scale finite, as in torch */
+
+dar_optim_config dar_optim_default(void)
+{
+    return (dar_optim_config){
+        .rate = 1e-4, .beta1 = 0.9, .beta2 = 0.999, .eps = 1e-10, .decay = 0.03, .max_norm = 0.05, .warmup = 200
+    };
+}
+
+void dar_optim_init(dar_optim *o, const dar_optim_config *c, dar_params *p, dar_arena *a)
+{
+    *o = (dar_optim){ .config = *c, .params = p };
+    o->m = dar_arena_push(a, dar_mul_size(p->count, sizeof *o->m));
+    o->v = dar_arena_push(a, dar_mul_size(p->count, sizeof *o->v));
+    for (size_t i = 0; i < p->count; i++) {
+        const dar_param *q = p->at[i];
+        dar_tensor none = { 0 };
+        if (!a->plan) o->m[i] = o->v[i] = none;
+        if (!q->trainable) continue;
+        DAR_ASSERT(q->g.data, "optim: %s has no gradient memory", q->name);
+        dar_tensor m = dar_tensor_push(a, p->main, q->x.shape), v = dar_tensor_push(a, p->main, q->x.shape);
+        if (a->plan) continue;
+        dar_tensor_fill(&m, 0);
+        dar_tensor_fill(&v, 0);
+        o->m[i] = m;
+        o->v[i] = v;
+    }
+}
+
+static double square_sum(void *ctx, size_t begin, size_t end)
+{
+    const dar_tensor *g = ctx;
+    const void *x = dar_tensor_at(g, begin);
+    return dar_kern_for(g->dtype)->dot(end - begin, x, x);
+}
+
+double dar_optim_norm(const dar_params *p)
+{
+    double sum = 0;
+    for (size_t i = 0; i < p->count; i++) {
+        dar_tensor g = p->at[i]->g;
+        if (p->at[i]->trainable) sum += dar_parallel_sum(dar_tensor_count(&g), CHUNK, square_sum, &g);
+    }
+    return sqrt(sum);
+}
+
+static const char *find_nonfinite(const dar_params *p)
+{
+    for (size_t i = 0; i < p->count; i++)
+        if (p->at[i]->trainable && dar_tensor_nonfinite(&p->at[i]->g) >= 0) return p->at[i]->name;
+    return NULL;
+}
+
+dar_optim_report dar_optim_step(dar_optim *o)
+{
+    const dar_optim_config *c = &o->config;
+    dar_params *p = o->params;
+    double k = (double)o->steps, t = k + 1;
+    dar_optim_report r = { .norm = dar_optim_norm(p), .rate = c->rate };
+    if (o->steps < c->warmup) r.rate *= k / (double)c->warmup;
+    r.skipped = !isfinite(r.norm);
+    if (r.skipped) r.nonfinite = find_nonfinite(p);
+
+    dar_adamw a = { .rate = r.rate, .beta1 = c->beta1, .beta2 = c->beta2, .eps = c->eps, .decay = c->decay };
+    a.fix1 = 1 / (1 - pow(c->beta1, t));
+    a.fix2 = 1 / (1 - pow(c->beta2, t));
+    a.scale = c->max_norm > 0 ? fmin(1, c->max_norm / (r.norm + CLIP_TINY)) : 1;
+    for (size_t i = 0; i < p->count; i++) {
+        dar_param *q = p->at[i];
+        if (!q->trainable) continue;
+        if (!r.skipped)
+            dar_row_adamw(&a, p->main, p->main, dar_tensor_count(&q->x), q->x.data, o->m[i].data, o->v[i].data,
+                          q->g.data);
+        dar_tensor_fill(&q->g, 0);
+    }
+    if (r.skipped) o->skipped++;
+    else o->steps++;
+    return r;
+}
