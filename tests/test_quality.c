@@ -422,6 +422,13 @@ static void changed_files(void **state)
     assert_int_equal(q.result[DAR_QUALITY_FINITE].frame, 3);
     CHECK_NEAR("not finite", q.result[DAR_QUALITY_FINITE].found, 1, 0);
     CHECK_NEAR("pixels that differ", q.result[DAR_QUALITY_MASK].found, 1, 0);
+
+    dar_bundle *b; /* what cannot be read has no quality */
+    snprintf(path, sizeof path, "%s/gbuffer.h5", bundle);
+    assert_int_equal(truncate(path, 3000), 0);
+    ok(dar_bundle_open(&b, bundle, &e), &e);
+    CHECK(dar_quality_check(&q, b, &e) == DAR_ERR_FORMAT && strstr(e.text, "gbuffer.h5"), "%s", e.text);
+    dar_bundle_close(b);
 }
 
 /* ---------------------------------------------------------------- what passes, and how it is told */
