@@ -130,11 +130,12 @@ struct family {
     size_t bytes;
 };
 
-#define FAMILIES 7
+#define FAMILIES 9
 
 static void families_of(const dar_gbuffer *g, struct family f[FAMILIES])
 {
-    const struct family all[FAMILIES] = { { g->tracking, 12 }, { g->instance, 4 }, { g->part, 4 }, { g->world, 12 },
+    const struct family all[FAMILIES] = { { g->tracking, 12 }, { g->instance, 4 }, { g->part, 4 },
+                                          { g->triangle, 4 },  { g->corner, 8 },   { g->world, 12 },
                                           { g->normal, 12 },   { g->depth, 4 },    { g->mask, 1 } };
     memcpy(f, all, sizeof all);
 }
@@ -272,7 +273,8 @@ void dar_raster_draw(dar_raster *r, const dar_pose *p, const dar_view *v, const 
 {
     struct dar_raster_inside *in = r->in;
     double *seconds = r->stats.seconds, mark = dar_log_clock();
-    bool moved = !in->drawn || !same_view(v, &r->view), fresh = !in->drawn || (out->normal && !in->has_normals);
+    bool moved = !in->drawn || !same_view(v, &r->view), normals = out->normal || out->corner;
+    bool fresh = !in->drawn || (normals && !in->has_normals);
 
     DAR_ASSERT(p->scene == r->scene, "raster: pose of another scene");
     DAR_ASSERT(r->identity || (!out->tracking && !out->part), "raster: no identity, but tracking or part asked for");
@@ -283,9 +285,9 @@ void dar_raster_draw(dar_raster *r, const dar_pose *p, const dar_view *v, const 
         seconds[DAR_STAGE_COPY] += lap(&mark);
         return;
     }
-    in->has_normals = out->normal != NULL;
+    in->has_normals = normals;
     memcpy(in->mirrored, p->mirrored, r->scene->instances * sizeof *in->mirrored);
-    dar_pose_vertices(p, r->position, out->normal ? r->normal : NULL, !fresh);
+    dar_pose_vertices(p, r->position, normals ? r->normal : NULL, !fresh);
     seconds[DAR_STAGE_POSE] += lap(&mark);
     dar_raster_transform(r, p, moved);
     seconds[DAR_STAGE_TRANSFORM] += lap(&mark);

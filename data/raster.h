@@ -68,6 +68,8 @@ typedef struct dar_gbuffer {
     float *normal;      /* [3, H, W] interpolated, unit length, in the world; the triangle's own where there is none */
     float *depth;       /* [H, W] along the camera's z */
     uint8_t *mask;      /* [H, W] 1: a surface */
+    uint32_t *triangle; /* [H, W] number in the instance's mesh + 1 */
+    float *corner;      /* [2, H, W] barycentric coordinates of the triangle's corners 1 and 2 */
 } dar_gbuffer;
 
 typedef enum dar_raster_stage {
@@ -103,7 +105,7 @@ typedef struct dar_raster {
 
     /* What was drawn last. */
     dar_view view;
-    float *position, *normal; /* [scene->vertices, 3] posed */
+    float *position, *normal; /* [scene->vertices, 3] posed; normals if the family or `corner` was asked for */
 
     /* Of the rasteriser itself. */
     struct dar_raster_inside *in;

@@ -14,7 +14,7 @@ struct surface {
     double own[3];           /* its own normal, outwards, not of unit length */
     double origin[3], scale; /* colour of rest coordinates */
     double turn;             /* of the normal: 1 or -1 */
-    uint32_t part;
+    uint32_t part, triangle;
 };
 
 struct job {
@@ -66,6 +66,7 @@ static void set_surface(const struct job *j, struct surface *s, size_t id)
 
     s->piece = &r->in->piece[id / DAR_RASTER_PIECE];
     t = s->piece->triangle + id % DAR_RASTER_PIECE;
+    s->triangle = (uint32_t)t;
     dar_raster_corners(r, s->piece->instance, t, corner);
     dar_raster_edges_of(r, corner, &s->edges);
     for (int k = 0; k < 3; k++) {
@@ -117,6 +118,8 @@ static void resolve_pixel(const struct job *j, const struct surface *s, double d
     if (out->mask) out->mask[at] = 1;
     if (out->instance) out->instance[at] = s->piece->instance + 1;
     if (out->part) out->part[at] = s->part;
+    if (out->triangle) out->triangle[at] = s->triangle + 1;
+    for (size_t c = 0; c < 2 && out->corner; c++) out->corner[c * pixels + at] = (float)b[c + 1];
     if (out->depth) out->depth[at] = (float)(b[0] * s->depth[0] + b[1] * s->depth[1] + b[2] * s->depth[2]);
     if (out->world || out->normal) blend(b, (double(*)[3])s->world, x);
     if (out->world) store(out->world, pixels, at, x);
@@ -146,9 +149,11 @@ static void clear_row(const dar_raster *r, const dar_gbuffer *out, size_t at, si
         clear(out->tracking, 4, c * pixels + at, n);
         clear(out->world, 4, c * pixels + at, n);
         clear(out->normal, 4, c * pixels + at, n);
+        if (c < 2) clear(out->corner, 4, c * pixels + at, n);
     }
     clear(out->instance, 4, at, n);
     clear(out->part, 4, at, n);
+    clear(out->triangle, 4, at, n);
     clear(out->depth, 4, at, n);
     clear(out->mask, 1, at, n);
 }

@@ -179,9 +179,13 @@ typedef struct drawn {
 
 static inline dar_gbuffer drawn_buffers(dar_arena *a, size_t pixels)
 {
-    dar_gbuffer g = { dar_arena_push(a, 12 * pixels), dar_arena_push(a, 4 * pixels),  dar_arena_push(a, 4 * pixels),
-                      dar_arena_push(a, 12 * pixels), dar_arena_push(a, 12 * pixels), dar_arena_push(a, 4 * pixels),
-                      dar_arena_push(a, pixels) };
+    dar_gbuffer g = { .tracking = dar_arena_push(a, 12 * pixels),
+                      .instance = dar_arena_push(a, 4 * pixels),
+                      .part = dar_arena_push(a, 4 * pixels),
+                      .world = dar_arena_push(a, 12 * pixels),
+                      .normal = dar_arena_push(a, 12 * pixels),
+                      .depth = dar_arena_push(a, 4 * pixels),
+                      .mask = dar_arena_push(a, pixels) };
     memset(g.tracking, 0xff, 12 * pixels), memset(g.instance, 0xff, 4 * pixels), memset(g.part, 0xff, 4 * pixels);
     memset(g.world, 0xff, 12 * pixels), memset(g.normal, 0xff, 12 * pixels), memset(g.depth, 0xff, 4 * pixels);
     memset(g.mask, 0xff, pixels);
