@@ -113,6 +113,24 @@ static dar_status read_texture(dar_gltf *g, dar_json info, bool images, dar_mate
     return find_image(g, image);
 }
 
+static double share(dar_json j, const char *key)
+{
+    return fmin(fmax(dar_json_number(j, key, 1, -DAR_GLTF_LARGEST, DAR_GLTF_LARGEST), 0), 1);
+}
+
+/* Where a texture varies them, factors say little: then as if nothing were known. */
+static void read_surface(dar_json j, bool glossy, dar_material *m)
+{
+    if (dar_json_get(j, glossy ? "specularGlossinessTexture" : "metallicRoughnessTexture").item) {
+        m->gloss = DAR_GLOSS_UNKNOWN;
+    } else if (glossy) {
+        m->gloss = share(j, "glossinessFactor");
+    } else {
+        m->gloss = 1 - share(j, "roughnessFactor");
+        m->metallic = share(j, "metallicFactor");
+    }
+}
+
 static dar_status read_material(dar_gltf *g, dar_json j, bool images, dar_material *m, dar_gltf_texture *t)
 {
     static const char *const modes[] = { "OPAQUE", "MASK", "BLEND", NULL };
@@ -128,6 +146,8 @@ static dar_status read_material(dar_gltf *g, dar_json j, bool images, dar_materi
     DAR_TRY(dar_gltf_check(g));
     if (!rough.item) return DAR_OK;
     DAR_TRY(dar_gltf_numbers(g, rough, glossy ? "diffuseFactor" : "baseColorFactor", m->color, 4));
+    read_surface(rough, glossy, m);
+    DAR_TRY(dar_gltf_check(g));
     dar_json info = dar_json_get(rough, glossy ? "diffuseTexture" : "baseColorTexture");
     return info.item ? read_texture(g, info, images, m, t) : dar_gltf_check(g);
 }

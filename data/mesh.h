@@ -114,10 +114,14 @@ typedef struct dar_lens {
 typedef enum dar_alpha { DAR_ALPHA_OPAQUE, DAR_ALPHA_MASK, DAR_ALPHA_BLEND } dar_alpha;
 typedef enum dar_wrap { DAR_WRAP_REPEAT, DAR_WRAP_CLAMP, DAR_WRAP_MIRROR } dar_wrap;
 
+#define DAR_GLOSS_UNKNOWN 0.4 /* of surfaces about which nothing is said */
+
 typedef struct dar_material {
     const char *name;
     double color[4]; /* base colour, linear, times the texture's and the vertex's */
     int image;       /* sRGB, or DAR_NONE */
+    double gloss;    /* 1 - roughness; 0: matte */
+    double metallic; /* 0 to 1 */
     dar_wrap wrap_u, wrap_v;
     bool nearest; /* texels are not blended when the texture is magnified */
     dar_alpha alpha;
