@@ -5,8 +5,7 @@
 
 #define FARTHEST 1e9 /* texels; beyond, f64 still counts them, int does not */
 
-/* Texel i of n, wrapped. */
-static size_t wrap(double i, size_t n, dar_wrap mode)
+size_t dar_texture_wrap(double i, size_t n, dar_wrap mode)
 {
     double m = (double)n;
     if (mode == DAR_WRAP_CLAMP) return i < 0 ? 0 : i >= m ? n - 1 : (size_t)i;
@@ -27,7 +26,8 @@ double dar_texture_alpha(const dar_scene *s, const dar_material *m, double u, do
     if (!m->nearest) x -= 0.5, y -= 0.5;
     double x0 = floor(x), y0 = floor(y);
     for (int k = 0; k < 4; k++) {
-        size_t column = wrap(x0 + (k & 1), im->width, m->wrap_u), row = wrap(y0 + (k >> 1), im->height, m->wrap_v);
+        size_t column = dar_texture_wrap(x0 + (k & 1), im->width, m->wrap_u);
+        size_t row = dar_texture_wrap(y0 + (k >> 1), im->height, m->wrap_v);
         alpha[k] = im->rgba[4 * (row * im->width + column) + 3] / 255.0;
         if (m->nearest) return alpha[0];
     }

@@ -1,0 +1,103 @@
+/* shade.c: memory, and the stages of a frame in their order. */
+#include "data/shade.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "data/shade_inside.h"
+#include "lib/log.h"
+#include "lib/thread.h"
+
+const char *const dar_shade_stage_name[] = { "samples", "shadows", "light" };
+
+dar_shade_config dar_shade_default(int width, int height)
+{
+    return (dar_shade_config){ .raster = dar_raster_default(width, height),
+                               .samples = 2,
+                               .shadow_side = 768,
+                               .lighting = dar_lighting_of(0, false) };
+}
+
+static void init_shadows(dar_shade *s, dar_arena *a)
+{
+    const dar_shade_config *c = &s->config;
+    double size = 0;
+    for (int k = 0; k < 3; k++) size = fmax(size, c->hi[k] - c->lo[k]);
+    for (size_t i = 0; i < c->lighting.suns; i++) {
+        dar_shadow_config w = { .side = c->shadow_side,
+                                .width = c->lighting.softness * size,
+                                .blend_cutoff = c->raster.blend_cutoff };
+        if (!c->lighting.sun[i].shadow) continue;
+        memcpy(w.toward, c->lighting.sun[i].toward, sizeof w.toward);
+        memcpy(w.lo, c->lo, sizeof w.lo);
+        memcpy(w.hi, c->hi, sizeof w.hi);
+        dar_shadow_init(&s->shadow[i], s->scene, &w, a);
+    }
+}
+
+void dar_shade_init(dar_shade *s, const dar_scene *scene, const dar_shade_config *c, dar_arena *a)
+{
+    dar_raster_config r = c->raster;
+    DAR_ASSERT(c->samples >= 1 && c->samples <= DAR_SHADE_SAMPLES, "shade: %d samples", c->samples);
+    DAR_ASSERT(r.width <= DAR_RASTER_MAX_SIDE / c->samples && r.height <= DAR_RASTER_MAX_SIDE / c->samples,
+               "shade: picture of %d x %d with %d x %d samples", r.width, r.height, c->samples, c->samples);
+    DAR_ASSERT(c->lighting.suns <= DAR_LIGHTS_MOST && c->lighting.bulbs <= DAR_LIGHTS_MOST,
+               "shade: %zu suns, %zu bulbs", c->lighting.suns, c->lighting.bulbs);
+
+    *s = (dar_shade){ .scene = scene, .config = *c };
+    r.width *= c->samples;
+    r.height *= c->samples;
+    size_t samples = (size_t)r.width * (size_t)r.height;
+    s->srgb = dar_arena_push(a, sizeof *s->srgb);
+    s->sky = dar_arena_push(a, sizeof *s->sky);
+    if (!a->plan) {
+        dar_srgb_init(s->srgb);
+        dar_skylight_init(s->sky, &c->lighting);
+    }
+    dar_raster_init(&s->raster, scene, NULL, &r, a);
+    s->g.instance = dar_arena_push(a, dar_mul_size(samples, sizeof(uint32_t)));
+    s->g.triangle = dar_arena_push(a, dar_mul_size(samples, sizeof(uint32_t)));
+    s->g.corner = dar_arena_push(a, dar_mul_size(samples, 2 * sizeof(float)));
+    s->mip = dar_mip_init(scene, s->srgb, a);
+    init_shadows(s, a);
+}
+
+/* ---------------------------------------------------------------- a frame */
+
+/* Seconds since *mark, which moves on. */
+static double lap(double *mark)
+{
+    double now = dar_log_clock(), d = now - *mark;
+    *mark = now;
+    return d;
+}
+
+static dar_view finer(const dar_view *v, int n)
+{
+    dar_view y = *v;
+    y.width *= n, y.height *= n;
+    y.fx *= n, y.fy *= n, y.cx *= n, y.cy *= n;
+    return y;
+}
+
+void dar_shade_draw(dar_shade *s, const dar_pose *p, const dar_view *v, uint8_t *rgb)
+{
+    const dar_lighting *l = &s->config.lighting;
+    double mark = dar_log_clock();
+    size_t copied = s->raster.stats.copied;
+    dar_view fine = finer(v, s->config.samples);
+
+    s->frames++;
+    dar_raster_draw(&s->raster, p, &fine, &s->g, s->drawn ? &s->g : NULL);
+    s->drawn = true;
+    s->seconds[DAR_SHADE_DRAW] += lap(&mark);
+    if (s->raster.stats.copied > copied) {
+        s->copied++;
+        return;
+    }
+    for (size_t i = 0; i < l->suns; i++)
+        if (l->sun[i].shadow) dar_shadow_draw(&s->shadow[i], p);
+    s->seconds[DAR_SHADE_SHADOW] += lap(&mark);
+    dar_shade_light(s, v, rgb);
+    s->seconds[DAR_SHADE_LIGHT] += lap(&mark);
+}
