@@ -409,10 +409,8 @@ static void run_all(const char *filter, bool quickly, dar_arena *arena)
         const bench_row *rows;
         const size_t *n;
     } tables[] = {
-        { bench_product_rows, &bench_n_product_rows },
-        { bench_op_rows, &bench_n_op_rows },
-        { bench_net_rows, &bench_n_net_rows },
-        { bench_vae_rows, &bench_n_vae_rows },
+        { bench_product_rows, &bench_n_product_rows }, { bench_op_rows, &bench_n_op_rows },
+        { bench_net_rows, &bench_n_net_rows },         { bench_vae_rows, &bench_n_vae_rows },
         { bench_row_rows, &bench_n_row_rows },
     };
     int threads = dar_threads();
