@@ -54,8 +54,9 @@ typedef struct dar_dit {
     dar_dit_block *block; /* [layers] */
     dar_adapter adapter;
 
-    bool whole; /* record blocks as they are, not as recompute segments: faster, more memory */
-    bool keep;  /* keep the results of attention for the replay of a segment (tape.keep) */
+    bool quantise; /* products whose weights are stored in 8 bits round their operands too: faster, less exact */
+    bool whole;    /* record blocks as they are, not as recompute segments: faster, more memory */
+    bool keep;     /* keep the results of attention for the replay of a segment (tape.keep) */
 } dar_dit;
 
 /* Declare all parameters, under the names of the public checkpoint.  m->block is on the heap. */

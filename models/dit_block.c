@@ -5,7 +5,7 @@ enum { SHIFT, SCALE, GATE };
 
 dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *p, dar_act act, dar_val *x)
 {
-    dar_linear_opt o = { .act = act };
+    dar_linear_opt o = { .act = act, .quantise = m->quantise };
     dar_val *w = dar_param_operand(t, p->w, m->storage), *b = dar_param_leaf(t, p->b);
     if (!p->down || p->merged) return dar_linear(t, x, w, b, &o);
     return dar_lora(t, x, w, b, dar_param_leaf(t, p->down), dar_param_leaf(t, p->up), p->scale, &o);

@@ -42,6 +42,11 @@ dar_status dar_lora_write(const dar_dit *m, const char *path, dar_err *e);
 void dar_lora_merge(dar_dit *m, dar_params *p, dar_arena *scratch);
 void dar_lora_unmerge(dar_dit *m, dar_arena *scratch);
 
+/* Store the products of blocks [from, to) in 8 bits, a scale per row, for good; additions that are not trained are
+ * merged on the way, in f32.  Weights that were mapped are not needed any more.  m->quantise then says whether their
+ * operands are rounded to 8 bits too. */
+void dar_lora_quantise(dar_dit *m, dar_params *p, int64_t from, int64_t to, dar_arena *scratch);
+
 /* Declare the addition of one product; its scale is the caller's to set. */
 void dar_lora_declare(dar_dit *m, dar_params *p, int64_t block, dar_projection which, int64_t rank);
 

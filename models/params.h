@@ -3,11 +3,11 @@
  * A network declares what it has: name and shape as in the public checkpoint, role, how a fresh one is made.  Memory
  * comes afterwards, so that a caller can decide in between:
  *
- *     dar_params_init(&p, &model, DAR_BF16, e);
- *     dar_dit_init(&m, &p, &config);                        declares
- *     dar_params_train(&p, DAR_PARAM_LORA);                 what gets gradients
- *     dar_param_bind(dar_params_find(&p, name), &x, ...);   values from a file, or views of it
- *     dar_params_fresh(&p, DAR_PARAM_ALL, seed);            the rest
+ *     dar_params_init(&p, &model, DAR_BF16);
+ *     dar_dit_init(&m, &p, &config.dit, &config.adapter);        declares
+ *     dar_params_train(&p, DAR_PARAM_LORA);                      what gets gradients
+ *     dar_param_bind(&p, dar_params_find(&p, name), &x);         values from a file, or views of it
+ *     dar_params_fresh(&p, DAR_PARAM_ALL, seed);                 the rest
  *     dar_params_gradients(&p);
  *
  * Types: a matrix is stored in the table's storage type (it is an operand of a large product), everything else in its

@@ -14,6 +14,7 @@
 
 static int64_t layers, frames, size[2], rank, words;
 static const char *preset;
+static bool eight;
 static dar_common common;
 
 static const dar_option options[] = {
@@ -63,6 +64,7 @@ static const dar_option options[] = {
       .lo = 0,
       .hi = 4096,
       .help = "a training step of LoRA of this rank; 0: an evaluation" },
+    { .name = "eight", .type = DAR_ARG_FLAG, .target = &eight, .help = "products of blocks in 8 bits by 8 bits" },
 };
 
 /* ---------------------------------------------------------------- a network, planned or real */
@@ -119,6 +121,8 @@ static dar_status make(struct network *n, const dar_config *c, const size_t *byt
     n->m.keep = true;
     dar_params_fresh(&n->p, DAR_PARAM_ALL, 1);
     dar_params_gradients(&n->p);
+    if (eight) dar_lora_quantise(&n->m, &n->p, 0, c->dit.layers, &n->arena[STEP]);
+    n->m.quantise = eight;
     make_clip(n, c);
     return DAR_OK;
 }
