@@ -33,7 +33,7 @@ isa     = $(if $(filter %_avx2,$1),$(AVX2)) $(if $(filter %_avx512,$1),$(AVX512)
 # A fuzz target is called by the fuzzer under this one name; in a test, where all of them are linked, by its file's.
 alias   = $(if $(filter-out fuzz,$(MODE)),$(if $(filter tests/fuzz_%,$1),-DLLVMFuzzerTestOneInput=$(notdir $1)))
 
-ROOMS := lib autograd autograd/ops models data train
+ROOMS := lib autograd autograd/ops models data train infer
 
 # A program dar-NAME is ROOM/dar_NAME.c with its main, ROOM/dar_NAME_*.c and the library.
 HALLS    := data train infer
@@ -101,7 +101,8 @@ $B/test_%: $B/tests/test_%.o $B/libdar.a
 
 $B/test_corpus: $(FUZZ:%=$B/tests/%.o)
 
-$B/test_config $B/test_dit $B/test_adapter $B/test_lora $B/test_scene $B/test_step $B/test_load: $B/tests/model.o
+$B/test_config $B/test_dit $B/test_adapter $B/test_lora $B/test_scene $B/test_step $B/test_load \
+$B/test_sampler: $B/tests/model.o
 
 test: deps ## install what is missing, build, run every test; the last line counts them
 	@$(MAKE) --no-print-directory test-built

@@ -1,0 +1,93 @@
+/* sampler.h: from noise to the latent of a video: a solver's steps around the transformer.
+ *
+ *     v = c + (g - 1) (c - u)    the velocity that a step takes: c with the prompt, u with the negative one, g guidance
+ *
+ * Work is done at the rate at which its input changes.  Each way of not doing something twice is exact, has a name, and
+ * can be left off, so that it can be compared and its saving told:
+ *
+ *   pass      equal prompts, or g = 1: u is not computed
+ *   scene     adapter and known video enter the patch embedding once, not in every call of the network
+ *   text      keys and values of a prompt once, not in every call
+ *   times     one embedding of time for the first frame and one for the rest, not one per frame
+ *   padding   the zeros after a prompt are one weighted key
+ *   lora      low-rank additions are added to the weights once (infer/model.h)
+ *   repeat    pieces of the known video that must encode to the same are not encoded (infer/pipeline.h)
+ *
+ * One clip at a time; the same bits for any number of threads.  Source: the paper, section 4.3; Ho and Salimans 2022,
+ * eq. 6 (guidance). */
+#ifndef DAR_INFER_SAMPLER_H
+#define DAR_INFER_SAMPLER_H
+
+#include "models/dit.h"
+#include "models/solver.h"
+
+typedef enum dar_skip {
+    DAR_SKIP_PASS,
+    DAR_SKIP_SCENE,
+    DAR_SKIP_TEXT,
+    DAR_SKIP_TIMES,
+    DAR_SKIP_PADDING,
+    DAR_SKIP_LORA,
+    DAR_SKIP_REPEAT,
+    DAR_SKIPS
+} dar_skip;
+
+extern const char *const dar_skip_name[DAR_SKIPS + 1]; /* "pass", ..., NULL */
+
+#define DAR_SKIPS_ALL ((1u << DAR_SKIPS) - 1)
+
+typedef struct dar_sampler_config {
+    dar_solver_config solver;
+    double guidance; /* g; 1: none */
+    unsigned skip;   /* bits 1 << dar_skip */
+} dar_sampler_config;
+
+/* The paper's: 50 steps of Euler, shift 5, guidance 3; every skip. */
+dar_sampler_config dar_sampler_default(void);
+
+/* What is constant over a clip; lives as long as the sampler. */
+typedef struct dar_sampler_clip {
+    int64_t frames, height, width; /* of the latent */
+    dar_tensor cond;               /* [1, C, F, H, W] of the adapter, f32; data NULL: its output counts as 0 */
+    dar_tensor text[2];            /* [1, n, text width]: prompt, negative prompt; data NULL: no token */
+} dar_sampler_clip;
+
+typedef struct dar_sampler {
+    const dar_dit *m;
+    dar_sampler_config c;
+    dar_sampler_clip clip;
+    bool twice;   /* a step calls the network for both prompts */
+    size_t calls; /* of the network, so far */
+
+    /* Of the sampler itself. */
+    dar_tape kept, step;
+    dar_dit_scene scene;
+    dar_dit_text text[2];
+} dar_sampler;
+
+/* Prepare the clip.  What lives as long as the sampler, or a run, lies in `kept`, what lives a call in `step`; both may
+ * be planning arenas, then nothing is computed.  On failure *s is freed. */
+dar_status dar_sampler_init(dar_sampler *s, const dar_dit *m, const dar_sampler_config *c, const dar_sampler_clip *clip,
+                            dar_arena *kept, dar_arena *step, dar_err *e);
+void dar_sampler_free(dar_sampler *s); /* accepts a zeroed one; the arenas are the caller's */
+
+/* After each step: how many are done, and the latent as it is.  Anything but DAR_OK ends the run. */
+typedef dar_status dar_sampler_told(void *ctx, size_t done, const dar_tensor *z, dar_err *e);
+
+/* z [1, latent, F, h, w] of the main type: noise becomes the latent.
+ *
+ * known [1, mask + latent, F, h, w] (dar_dit_known), or NULL: nothing is.  first, whose first frame z's keeps, and
+ * whose time is then 0, or NULL.  May be called again, for the same clip with another picture or noise.
+ * DAR_ERR_NUMERIC: the velocity of a step is not finite. */
+dar_status dar_sampler_run(dar_sampler *s, const dar_tensor *known, const dar_tensor *first, const dar_tensor *z,
+                           dar_sampler_told *told, void *ctx, dar_err *e);
+
+/* So far, preparation included [FLOP]. */
+double dar_sampler_flops(const dar_sampler *s);
+
+/* Noise for z, the same in every type but for rounding: the program's own stream, or what torch.randn of this shape
+ * gives in f32 after torch.manual_seed(seed), for which `scratch` holds z in f32. */
+typedef enum dar_noise { DAR_NOISE_OWN, DAR_NOISE_TORCH } dar_noise;
+void dar_sampler_noise(dar_noise kind, uint64_t seed, const dar_tensor *z, dar_arena *scratch);
+
+#endif

@@ -1,0 +1,333 @@
+/* test_sampler.c: the sampler against five steps of the public reference (scripts/make-dit-fixtures.py); what must hold
+ * whatever the numbers are: skips, guidance, threads, planning. */
+#include "tests/test.h"
+
+#include "infer/sampler.h"
+#include "lib/rng.h"
+#include "lib/rng_torch.h"
+#include "lib/thread.h"
+#include "tests/model.h"
+
+/* Largest deviation over the largest value. */
+static double distance(const dar_tensor *x, const dar_tensor *y)
+{
+    double most = 0, off = 0;
+    for (size_t i = 0; i < dar_tensor_count(y); i++) {
+        double a = dar_dtype_get(x->dtype, x->data, i), b = dar_dtype_get(y->dtype, y->data, i);
+        if (!(fabs(a - b) <= off)) off = fabs(a - b);
+        most = fmax(most, fabs(b));
+    }
+    return off / most;
+}
+
+static dar_weights *open_fixture(const char *path)
+{
+    dar_weights *f;
+    dar_err e;
+    CHECK(dar_weights_open(&f, path, &e) == DAR_OK, "%s", e.text);
+    return f;
+}
+
+/* ---------------------------------------------------------------- the fixture's first clip */
+
+struct bench {
+    model o;
+    dar_weights *weights, *lora;
+    dar_arena kept;
+    dar_sampler_config c;
+    dar_sampler_clip clip;
+    dar_tensor known, first, noise;
+    bool alone; /* nothing is known of the video */
+};
+
+static dar_tensor first_clip(struct bench *b, const dar_tensor *x, dar_dtype type, int64_t rows)
+{
+    dar_tensor from = dar_tensor_narrow(x, 0, 0, 1);
+    if (rows) from = dar_tensor_narrow(&from, 1, 0, rows);
+    dar_tensor y = dar_tensor_push(&b->o.weights, type, from.shape);
+    dar_tensor_copy(&y, &from);
+    return y;
+}
+
+static void init(struct bench *b, dar_dtype storage)
+{
+    dar_config c = model_preset("dar-test");
+    dar_err e;
+    *b = (struct bench){ .c = dar_sampler_default() };
+    b->weights = open_fixture("tests/fixtures/dit_weights.safetensors");
+    b->lora = open_fixture("tests/fixtures/dit_lora.safetensors");
+    model_init(&b->o, &c, storage, false);
+    dar_lora_init(&b->o.m, &b->o.p, &c.lora);
+    model_fixture(&b->o, b->weights);
+    dar_lora_read_options o = { .alpha = c.lora.alpha, .strength = 1 };
+    CHECK(dar_lora_read(&b->o.m, &b->o.p, b->lora, &o, &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_arena_init(&b->kept, "kept", (size_t)16 << 20, &e), DAR_OK);
+
+    dar_dtype main = b->o.p.main;
+    b->clip = (dar_sampler_clip){ .frames = 3, .height = 4, .width = 6 };
+    b->clip.cond = first_clip(b, &b->o.clip.cond, DAR_F32, 0);
+    b->clip.text[0] = first_clip(b, &b->o.text, main, 4);
+    dar_tensor second = dar_tensor_narrow(&b->o.text, 0, 1, 1);
+    b->clip.text[1] = first_clip(b, &second, main, 0);
+    b->known = first_clip(b, &b->o.clip.known, main, 0);
+    dar_tensor latent = dar_tensor_narrow(&b->known, 1, c.dit.mask, c.dit.latent);
+    b->first = first_clip(b, &latent, main, 0);
+    b->noise = first_clip(b, &b->o.z, main, 0);
+    b->c.solver.steps = 5;
+}
+
+static void drop(struct bench *b)
+{
+    model_free(&b->o);
+    dar_arena_free(&b->kept);
+    dar_weights_close(b->weights);
+    dar_weights_close(b->lora);
+}
+
+struct walk {
+    dar_weights *steps; /* NULL: nobody compares */
+    size_t seen, stop;  /* stop after so many; 0: never */
+    double worst;
+};
+
+static dar_status look(void *ctx, size_t done, const dar_tensor *z, dar_err *e)
+{
+    struct walk *w = ctx;
+    assert_int_equal(done, ++w->seen);
+    if (w->steps) {
+        char name[16];
+        dar_tensor y;
+        snprintf(name, sizeof name, "step.%zu", done);
+        assert_int_equal(dar_weights_tensor(w->steps, name, &y, e), DAR_OK);
+        w->worst = fmax(w->worst, distance(z, &y));
+        CHECK(w->worst >= 0, "step %zu is not finite", done);
+    }
+    return done == w->stop ? dar_fail(e, DAR_ERR_INTERRUPTED, "enough") : DAR_OK;
+}
+
+/* Run into a fresh copy of the noise; *calls (may be NULL): of the network. */
+static dar_tensor sample(struct bench *b, struct walk *w, size_t *calls)
+{
+    dar_err e;
+    dar_sampler s;
+    dar_tensor z = dar_tensor_push(&b->o.weights, b->noise.dtype, b->noise.shape);
+    dar_tensor_copy(&z, &b->noise);
+    dar_arena_reset(&b->kept, 0);
+    dar_arena_reset(&b->o.step, 0);
+    assert_int_equal(dar_sampler_init(&s, &b->o.m, &b->c, &b->clip, &b->kept, &b->o.step, &e), DAR_OK);
+    size_t used = b->kept.used;
+    dar_status status = dar_sampler_run(&s, b->alone ? NULL : &b->known, b->alone ? NULL : &b->first, &z, look, w, &e);
+    CHECK(status == (w->stop ? DAR_ERR_INTERRUPTED : DAR_OK), "%s", e.text);
+    assert_int_equal(b->kept.used, used);
+    assert_int_equal(b->o.step.used, 0);
+    if (calls) *calls = s.calls;
+    dar_sampler_free(&s);
+    return z;
+}
+
+static void same_bits(const dar_tensor *x, const dar_tensor *y)
+{
+    assert_int_equal(dar_tensor_bytes(x), dar_tensor_bytes(y));
+    assert_memory_equal(x->data, y->data, dar_tensor_bytes(x));
+}
+
+/* ---------------------------------------------------------------- tests */
+
+static void five_steps(void **state)
+{
+    (void)state;
+    dar_weights *steps = open_fixture("tests/fixtures/dit_steps.safetensors");
+    for (int merged = 0; merged < 2; merged++) {
+        struct bench b;
+        struct walk w = { .steps = steps };
+        init(&b, DAR_F64);
+        if (merged) dar_lora_merge(&b.o.m, &b.o.p, &b.o.step);
+        sample(&b, &w, NULL);
+        printf("sampler: five steps, low-rank additions %s: %.2g\n", merged ? "merged" : "apart", w.worst);
+        assert_int_equal(w.seen, 5);
+        CHECK_NEAR("latent", w.worst, 0, 1e-11); /* the velocity itself is within 1e-13 of the reference */
+        drop(&b);
+    }
+    dar_weights_close(steps);
+}
+
+/* Each skip by itself, and all at once. */
+static void skips_change_nothing(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    size_t calls;
+    init(&b, DAR_F32);
+    dar_tensor with = sample(&b, &w, &calls);
+    assert_int_equal(calls, 10);
+    for (int k = 0; k <= DAR_SKIP_LORA; k++) { /* the last: none at all */
+        w = (struct walk){ 0 };
+        b.c.skip = k == DAR_SKIP_LORA ? 0 : DAR_SKIPS_ALL & ~(1u << k);
+        dar_tensor without = sample(&b, &w, &calls);
+        double off = distance(&without, &with);
+        printf("sampler: without %s: %.2g\n", k == DAR_SKIP_LORA ? "any skip" : dar_skip_name[k], off);
+        CHECK_NEAR("latent", off, 0, 1e-5);
+        assert_int_equal(calls, 10);
+    }
+    drop(&b);
+}
+
+static void equal_prompts_are_one(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    size_t calls;
+    init(&b, DAR_F32);
+    b.clip.text[1] = first_clip(&b, &b.clip.text[0], b.o.p.main, 0);
+    dar_tensor one = sample(&b, &w, &calls);
+    assert_int_equal(calls, 5);
+    b.c.guidance = 1, w.seen = 0;
+    dar_tensor off = sample(&b, &w, &calls);
+    assert_int_equal(calls, 5);
+    same_bits(&one, &off);
+
+    b.c.guidance = 3, b.c.skip &= ~(1u << DAR_SKIP_PASS), w.seen = 0;
+    dar_tensor both = sample(&b, &w, &calls);
+    assert_int_equal(calls, 10);
+    CHECK_NEAR("both passes", distance(&both, &one), 0, 1e-5);
+
+    b.clip.text[0] = b.clip.text[1] = (dar_tensor){ 0 }; /* no token is equal to no token */
+    b.c.skip = DAR_SKIPS_ALL, w.seen = 0;
+    sample(&b, &w, &calls);
+    assert_int_equal(calls, 5);
+    drop(&b);
+}
+
+static void any_threads(void **state)
+{
+    (void)state;
+    int threads = dar_threads();
+    for (int type = DAR_F32; type <= DAR_BF16; type++) {
+        struct bench b;
+        dar_tensor z[3];
+        init(&b, (dar_dtype)type);
+        for (int n = 0; n < 3; n++) {
+            struct walk w = { 0 };
+            dar_threads_set(n + 1);
+            z[n] = sample(&b, &w, NULL);
+            same_bits(&z[n], &z[0]);
+        }
+        drop(&b);
+    }
+    dar_threads_set(threads);
+}
+
+/* One preparation, several runs: each as if alone.  A run that was stopped leaves nothing behind. */
+static void prepared_once(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    dar_err e;
+    dar_sampler s;
+    init(&b, DAR_F32);
+    dar_tensor alone = sample(&b, &w, NULL);
+    w = (struct walk){ .stop = 2 };
+    sample(&b, &w, NULL);
+    assert_int_equal(w.seen, 2);
+
+    dar_arena_reset(&b.kept, 0);
+    assert_int_equal(dar_sampler_init(&s, &b.o.m, &b.c, &b.clip, &b.kept, &b.o.step, &e), DAR_OK);
+    for (int i = 0; i < 3; i++) {
+        dar_tensor z = dar_tensor_push(&b.o.weights, DAR_F32, b.noise.shape);
+        dar_tensor_copy(&z, &b.noise);
+        bool other = i == 1; /* nothing known, in between */
+        assert_int_equal(dar_sampler_run(&s, other ? NULL : &b.known, other ? NULL : &b.first, &z, NULL, NULL, &e),
+                         DAR_OK);
+        if (!other) same_bits(&z, &alone);
+        else CHECK(distance(&z, &alone) > 1e-3, "the known video does not matter");
+    }
+    dar_sampler_free(&s);
+    drop(&b);
+}
+
+static void plan_is_what_is_taken(void **state)
+{
+    (void)state;
+    for (int k = 0; k < DAR_SOLVERS; k++) {
+        struct bench b;
+        struct walk w = { 0 };
+        dar_arena kept, step;
+        dar_sampler s;
+        dar_err e;
+        init(&b, DAR_F32);
+        b.c.solver.kind = (dar_solver_kind)k;
+        b.c.solver.grid = dar_solver_grid(b.c.solver.kind);
+        b.kept.peak = b.o.step.peak = 0;
+        sample(&b, &w, NULL);
+
+        assert_int_equal(dar_arena_init_plan(&kept, "kept", &e), DAR_OK);
+        assert_int_equal(dar_arena_init_plan(&step, "step", &e), DAR_OK);
+        assert_int_equal(dar_sampler_init(&s, &b.o.m, &b.c, &b.clip, &kept, &step, &e), DAR_OK);
+        assert_int_equal(dar_sampler_run(&s, &b.known, &b.first, &b.noise, NULL, NULL, &e), DAR_OK);
+        assert_int_equal(kept.peak, b.kept.peak);
+        assert_int_equal(step.peak, b.o.step.peak);
+        assert_int_equal(s.calls, 10);
+        CHECK(dar_sampler_flops(&s) > 0, "nothing is counted");
+        dar_sampler_free(&s);
+        dar_arena_free(&kept);
+        dar_arena_free(&step);
+        drop(&b);
+    }
+}
+
+static void numbers_must_be_finite(void **state)
+{
+    (void)state;
+    struct bench b;
+    dar_err e;
+    dar_sampler s;
+    init(&b, DAR_F32);
+    assert_int_equal(dar_sampler_init(&s, &b.o.m, &b.c, &b.clip, &b.kept, &b.o.step, &e), DAR_OK);
+    ((float *)b.noise.data)[100] = NAN;
+    assert_int_equal(dar_sampler_run(&s, NULL, NULL, &b.noise, NULL, NULL, &e), DAR_ERR_NUMERIC);
+    CHECK(strstr(e.text, "step 1 of 5"), "%s", e.text);
+    dar_sampler_free(&s);
+    drop(&b);
+}
+
+static void noise(void **state)
+{
+    (void)state;
+    dar_arena a;
+    dar_rng_torch g;
+    dar_err e;
+    assert_int_equal(dar_arena_init(&a, "noise", 1 << 20, &e), DAR_OK);
+    dar_shape shape = DAR_SHAPE(1, 5, 3, 4, 6);
+    dar_tensor x = dar_tensor_push(&a, DAR_F32, shape), y = dar_tensor_push(&a, DAR_F64, shape);
+    for (int kind = DAR_NOISE_OWN; kind <= DAR_NOISE_TORCH; kind++) {
+        dar_sampler_noise((dar_noise)kind, 42, &x, &a);
+        dar_sampler_noise((dar_noise)kind, 42, &y, &a);
+        CHECK_NEAR("f32 and f64", distance(&x, &y), 0, kind == DAR_NOISE_TORCH ? 0 : 6e-8);
+    }
+    dar_tensor z = dar_tensor_push(&a, DAR_F32, shape);
+    dar_rng_torch_seed(&g, 42);
+    dar_rng_torch_normal(&g, &z);
+    same_bits(&x, &z);
+    dar_sampler_noise(DAR_NOISE_OWN, 43, &z, &a);
+    dar_sampler_noise(DAR_NOISE_OWN, 42, &x, &a);
+    CHECK(distance(&x, &z) > 0.1, "seeds do not matter");
+    dar_arena_free(&a);
+}
+
+int main(void)
+{
+    static const struct CMUnitTest tests[] = {
+        cmocka_unit_test(five_steps),
+        cmocka_unit_test(skips_change_nothing),
+        cmocka_unit_test(equal_prompts_are_one),
+        cmocka_unit_test(any_threads),
+        cmocka_unit_test(prepared_once),
+        cmocka_unit_test(plan_is_what_is_taken),
+        cmocka_unit_test(numbers_must_be_finite),
+        cmocka_unit_test(noise),
+    };
+    return cmocka_run_group_tests_name("sampler", tests, NULL, NULL) != 0;
+}
