@@ -299,7 +299,8 @@ static double raw_bytes(const dar_render *r)
         [DAR_FAMILY_MASK] = 1,     [DAR_FAMILY_SPARSE] = 3, [DAR_BUNDLE_ID] = 4,     [DAR_BUNDLE_PART] = 4
     };
     double sum = r->bundle.rgb ? 3 : 0, pixels = (double)r->raster.width * r->raster.height * (double)r->clip.frames;
-    for (int f = 0; f < DAR_BUNDLE_FAMILIES; f++) sum += r->bundle.families >> f & 1 ? bytes[f] : 0;
+    const unsigned families = r->bundle.families | 1u << DAR_FAMILY_MASK; /* always written */
+    for (int f = 0; f < DAR_BUNDLE_FAMILIES; f++) sum += families >> f & 1 ? bytes[f] : 0;
     return pixels * sum;
 }
 
