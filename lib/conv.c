@@ -1,4 +1,4 @@
-/* conv.c: convolution by the virtual operand col: y and gx with strides, and gw. */
+/* conv.c: convolution by the virtual operand col: y with a stride in time, gx with strides, and gw. */
 #include "lib/conv.h"
 
 #include <string.h>
@@ -104,7 +104,7 @@ static struct job job_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar
     return j;
 }
 
-/* Without col, where strides are 1: gx is a convolution of gy with the kernel turned round. */
+/* Without col: gx is a convolution of gy with the kernel turned round. */
 static dar_conv_slide slide_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_dtype w)
 {
     dar_conv_slide s = { .c = *c, .turned = pass == DAR_CONV_BACK_X, .x_type = x, .w_type = w };
@@ -131,7 +131,7 @@ static dar_conv_slide slide_of(const dar_conv *c, dar_conv_pass pass, dar_dtype 
 
 static bool slides(const dar_conv *c, dar_conv_pass pass)
 {
-    return pass != DAR_CONV_BACK_W && c->stride == 1 && c->stride_t == 1;
+    return c->stride_t == 1 && (pass == DAR_CONV_FORWARD || (pass == DAR_CONV_BACK_X && c->stride == 1));
 }
 
 size_t dar_conv_scratch(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_dtype w, int threads)

@@ -4,6 +4,9 @@
  *   channels in blocks  of x: packed for a run in all frames of the kernel, they fit half of the second-level cache
  *   tiles               pixels first: rows of w stay in the first-level cache, pixels stream past them
  *
+ * With a stride S in space a frame is S x S pictures, its phases: tap (i, j) is at (i / S, j / S) of phase (i mod S,
+ * j mod S), and each of those is packed for itself.
+ *
  * How channels are cut does not depend on the number of frames. */
 #include "lib/conv_slide.h"
 
@@ -30,6 +33,8 @@ struct job {
     const dar_tile *tile;
     dar_dtype operand, sum;              /* types of packed operands and of the result */
     size_t taps, units;                  /* kt kh kw; units of channels */
+    size_t tall, wide, phases;           /* phases that the kernel reads, along rows and along columns, and in all */
+    size_t kh, kw;                       /* of the kernel in one phase */
     size_t pitch, plane;                 /* pixels from row to row; of an output frame */
     size_t m, n, down, runs;             /* rows and pixels of a task, tasks along rows and along pixels */
     size_t ld, depth;                    /* distance of channels in packed pixels, units of a block */
@@ -41,9 +46,11 @@ struct job {
     char *a, *own;
 };
 
-/* Zeros after a row are those before the next one, and enough for the last output columns. */
-static size_t pitch_of(const dar_conv *c)
+/* Zeros after a row are those before the next one, and enough for the last output columns.  Rows of a phase begin with
+ * what the first output column reads. */
+static size_t pitch_of(const dar_conv *c, size_t kw)
 {
+    if (c->stride > 1) return c->Wo + kw - 1;
     size_t left = c->left > 0 ? (size_t)c->left : 0;
     int64_t end = (int64_t)(c->Wo + c->kw) - 1 - c->left;
     return dar_most(dar_most(c->W + left, c->Wo), end > 0 ? (size_t)end : 0);
@@ -53,7 +60,7 @@ static size_t pitch_of(const dar_conv *c)
  * cache. */
 static size_t packed_run(const struct job *j, size_t n)
 {
-    size_t line = DAR_ALIGN / j->tile->unit_bytes, around = (j->c->kh - 1) * j->pitch + j->c->kw - 1;
+    size_t line = DAR_ALIGN / j->tile->unit_bytes, around = (j->kh - 1) * j->pitch + j->kw - 1;
     return (dar_blocks(n + around, line) | 1) * line;
 }
 
@@ -61,7 +68,7 @@ static void cut(struct job *j)
 {
     const dar_conv *c = j->c;
     const dar_tile *t = j->tile;
-    size_t around = AROUND * (c->kh - 1) * j->pitch, elem = dar_dtype_size(j->sum);
+    size_t around = AROUND * (j->kh - 1) * j->pitch, elem = dar_dtype_size(j->sum);
     size_t limit = C_BYTES / elem / dar_most(dar_least(c->Cout, ROWS), 1), frames = c->B * c->To;
 
     limit = dar_most(dar_least(limit, around), PIXELS);
@@ -71,7 +78,7 @@ static void cut(struct job *j)
     j->down = dar_blocks(c->Cout, j->m);
     j->ld = packed_run(j, j->n);
 
-    size_t fit = B_BYTES / (c->kt * packed_run(j, dar_least(limit, j->plane)) * t->unit_bytes);
+    size_t fit = B_BYTES / (c->kt * j->phases * packed_run(j, dar_least(limit, j->plane)) * t->unit_bytes);
     j->depth = dar_most(dar_least(fit, STEPS / j->taps), 1);
     j->depth = dar_most(dar_blocks(j->units, dar_most(dar_blocks(j->units, j->depth), 1)), 1);
 }
@@ -84,7 +91,12 @@ static struct job job_of(const dar_conv_slide *s)
     struct job j = { .s = s, .c = c, .operand = of[kind], .sum = dar_compute_type(s->x_type) };
 
     j.taps = c->kt * c->kh * c->kw;
-    j.pitch = pitch_of(c);
+    j.tall = dar_least(c->stride, c->kh);
+    j.wide = dar_least(c->stride, c->kw);
+    j.phases = j.tall * j.wide;
+    j.kh = dar_blocks(c->kh, c->stride);
+    j.kw = dar_blocks(c->kw, c->stride);
+    j.pitch = pitch_of(c, j.kw);
     j.plane = c->Ho && c->Wo ? (c->Ho - 1) * j.pitch + c->Wo : 0;
     j.tile = dar_tile_fit(kind, c->Cout, dar_round_up(j.plane, 32)); /* tiles of 16 columns read w too often */
     j.units = dar_tile_units(j.tile, c->Cin);
@@ -95,7 +107,7 @@ static struct job job_of(const dar_conv_slide *s)
     j.row = j.packs_a ? (dar_blocks(j.units * j.taps, line) | 1) * line : j.units * j.taps;
     j.at_bytes = dar_round_up(j.taps * sizeof *j.at, DAR_ALIGN);
     j.a_bytes = j.packs_a ? c->Cout * j.row * unit : 0;
-    j.b_bytes = c->kt * j.depth * j.ld * unit;
+    j.b_bytes = c->kt * j.phases * j.depth * j.ld * unit;
     j.c_bytes = dar_round_up(j.m * j.n * dar_dtype_size(j.sum), DAR_ALIGN);
     j.fill_bytes = dar_round_up(FILL * j.ld * sizeof(double), DAR_ALIGN);
     return j;
@@ -135,10 +147,10 @@ static void pack_weights(void *ctx, size_t begin, size_t end, int thread)
 /* ---------------------------------------------------------------- pixels */
 
 /* n elements from place `at` of a frame whose rows are `pitch` apart: zero between and outside them. */
-static void fill(const struct job *j, dar_dtype to, char *dst, dar_dtype type, const char *frame, int64_t at, size_t n)
+static void fill(const struct job *j, dar_dtype type, char *dst, const char *frame, int64_t at, size_t n)
 {
     const dar_conv *c = &j->s->c;
-    size_t W = c->W, H = c->H, pitch = j->pitch, size = dar_dtype_size(to), from = dar_dtype_size(type);
+    size_t W = c->W, H = c->H, pitch = j->pitch, size = dar_dtype_size(type);
     size_t before = at < 0 ? dar_least((size_t)-at, n) : 0;
 
     if (W == pitch) W *= H, pitch = W, H = 1;
@@ -148,7 +160,7 @@ static void fill(const struct job *j, dar_dtype to, char *dst, dar_dtype type, c
     size_t p = at < 0 ? 0 : (size_t)at, h = p / pitch, w = p % pitch;
     for (; n && h < H; h++, w = 0) {
         size_t copy = w < W ? dar_least(W - w, n) : 0, gap = dar_least(pitch - w - copy, n - copy);
-        if (copy) dar_row_convert(to, dst, type, frame + (h * W + w) * from, copy);
+        if (copy) memcpy(dst, frame + (h * W + w) * size, copy * size);
         dar_clip_zero(dst + copy * size, gap, size);
         dst += (copy + gap) * size;
         n -= copy + gap;
@@ -156,53 +168,100 @@ static void fill(const struct job *j, dar_dtype to, char *dst, dar_dtype type, c
     dar_clip_zero(dst, n, size);
 }
 
-/* Channels from unit u on, in frame t: `units` rows of ld pixels from place `at`. */
-static void pack_frame(const struct job *j, size_t batch, int64_t t, size_t u, size_t units, int64_t at, char *b,
-                       char *buf)
+/* n elements, `step` apart in src. */
+static void take(size_t size, size_t n, const void *src, size_t step, void *dst)
+{
+#define TAKE(T)                                                                                                        \
+    if (step == 2)                                                                                                     \
+        for (size_t i = 0; i < n; i++) ((T *)dst)[i] = ((const T *)src)[2 * i];                                        \
+    else                                                                                                               \
+        for (size_t i = 0; i < n; i++) ((T *)dst)[i] = ((const T *)src)[i * step]
+    if (size == 2) TAKE(uint16_t);
+    else if (size == 4) TAKE(uint32_t);
+    else TAKE(uint64_t);
+#undef TAKE
+}
+
+/* n elements from place `at` of a phase: its row h, column w are row h S + y, column w S + x of the frame. */
+static void fill_phase(const struct job *j, dar_dtype type, char *dst, const char *frame, size_t phase, size_t at,
+                       size_t n)
+{
+    const dar_conv *c = &j->s->c;
+    size_t size = dar_dtype_size(type), S = c->stride;
+    int64_t y = (int64_t)(phase / j->wide + at / j->pitch * S) - c->top, x = (int64_t)(phase % j->wide) - c->left;
+    size_t first = x < 0 ? dar_blocks((size_t)-x, S) : 0, last = (int64_t)c->W > x ? dar_blocks(c->W - x, S) : 0;
+
+    for (size_t w = at % j->pitch; n; y += (int64_t)S, w = 0) {
+        size_t end = dar_least(j->pitch, w + n), low = dar_least(dar_most(w, first), end);
+        size_t high = dar_most(dar_least(last, end), low);
+        if (y < 0 || y >= (int64_t)c->H) low = high = end;
+        dar_clip_zero(dst, low - w, size);
+        if (high > low)
+            take(size, high - low, frame + (y * (int64_t)c->W + (int64_t)(low * S) + x) * (int64_t)size, S,
+                 dst + (low - w) * size);
+        dar_clip_zero(dst + (high - w) * size, end - high, size);
+        dst += (end - w) * size;
+        n -= end - w;
+    }
+}
+
+/* Rows r0.. of w, pixels q0.. of an output frame. */
+struct task {
+    size_t batch, t, r0, m, q0, n;
+    int64_t first; /* place of the first pixel that it reads, in frames; of phases it is q0 */
+    char *b, *c, *buf;
+};
+
+/* The frame that is read at kt. */
+static int64_t frame_at(const dar_conv *c, const struct task *w, size_t kt)
+{
+    return (int64_t)(w->t + kt) - c->front;
+}
+
+/* Channels from unit u on, of a phase in frame t: `units` rows of ld pixels. */
+static void pack_frame(const struct job *j, const struct task *w, int64_t t, size_t phase, size_t u, size_t units,
+                       char *b)
 {
     const dar_tile *tile = j->tile;
     size_t c0 = u * tile->unit, channels = dar_least(units * tile->unit, j->c->Cin - c0);
     dar_dtype type = j->operand;
 
-    if (!dar_clip_frame(&j->s->in, batch, c0, t, &type)) {
+    if (!dar_clip_frame(&j->s->in, w->batch, c0, t, &type)) {
         memset(b, 0, units * j->ld * tile->unit_bytes);
         return;
     }
     bool as_is = tile->unit == 1 && type == j->operand; /* a row of pixels is a row of units */
     for (size_t i = 0; i < channels; i += FILL) {
-        size_t k = dar_least(FILL, channels - i), size = dar_dtype_size(type);
-        char *rows = as_is ? b + i * j->ld * size : buf;
+        size_t k = dar_least(FILL, channels - i), row = j->ld * dar_dtype_size(type);
+        char *rows = as_is ? b + i * row : w->buf;
         for (size_t c = 0; c < k; c++) {
-            const char *frame = dar_clip_frame(&j->s->in, batch, c0 + i + c, t, &type);
-            fill(j, type, rows + c * j->ld * size, type, frame, at, j->ld);
+            const char *frame = dar_clip_frame(&j->s->in, w->batch, c0 + i + c, t, &type);
+            if (j->c->stride == 1) fill(j, type, rows + c * row, frame, w->first, j->ld);
+            else fill_phase(j, type, rows + c * row, frame, phase, w->q0, j->ld);
         }
         if (!as_is)
-            dar_tile_pack_b_wide(tile, type, buf, j->ld, k, j->ld, j->ld,
+            dar_tile_pack_b_wide(tile, type, rows, j->ld, k, j->ld, j->ld,
                                  b + i / tile->unit * j->ld * tile->unit_bytes);
     }
 }
 
 /* ---------------------------------------------------------------- tasks */
 
-/* Rows r0.. of w, pixels q0.. of an output frame. */
-struct task {
-    size_t batch, t, r0, m, q0, n;
-    int64_t first; /* place of the first pixel that it reads, in frames */
-    char *b, *c, *buf;
-};
-
 /* Ask for what a run reads of one frame and channel, counted from the first of unit u: memory would stand idle during
  * the product, and wait for every new channel afterwards. */
 static void ahead(const struct job *j, const struct task *w, size_t u, size_t piece)
 {
     const dar_conv *c = j->c;
-    size_t channel = u * j->tile->unit + piece / c->kt, row = w->first < 0 ? 0 : (size_t)w->first / j->pitch;
+    size_t channel = u * j->tile->unit + piece / c->kt, rows = dar_blocks(j->ld, j->pitch) * c->stride;
+    int64_t first = c->stride == 1 ? w->first / (int64_t)j->pitch : (int64_t)(w->q0 / j->pitch * c->stride) - c->top;
+    size_t row = first < 0 ? 0 : (size_t)first;
     dar_dtype type;
 
     if (channel >= c->Cin || row >= c->H) return;
-    const char *frame = dar_clip_frame(&j->s->in, w->batch, channel, (int64_t)(w->t + piece % c->kt) - c->front, &type);
+    const char *frame = dar_clip_frame(&j->s->in, w->batch, channel, frame_at(c, w, piece % c->kt), &type);
     if (!frame) return;
-    size_t size = dar_dtype_size(type) * c->W, rows = dar_least(dar_blocks(j->ld, j->pitch), c->H - row);
+    size_t size = dar_dtype_size(type) * c->W;
+    rows = dar_least(rows, c->H - row);
     for (size_t i = 0; i < rows * size; i += DAR_ALIGN) __builtin_prefetch(frame + row * size + i, 0, 2);
 }
 
@@ -266,9 +325,9 @@ static void task(void *ctx, size_t i, int thread)
     w.buf = w.c + j->c_bytes;
     for (size_t u = 0; u == 0 || u < j->units; u += j->depth) { /* of no channels: zeros */
         size_t units = dar_least(j->depth, j->units - u);
-        for (size_t kt = 0; kt < c->kt; kt++)
-            pack_frame(j, w.batch, (int64_t)(w.t + kt) - c->front, u, units, w.first,
-                       w.b + kt * j->depth * j->ld * bytes, w.buf);
+        for (size_t k = 0; k < c->kt * j->phases; k++)
+            pack_frame(j, &w, frame_at(c, &w, k / j->phases), k % j->phases, u, units,
+                       w.b + k * j->depth * j->ld * bytes);
         multiply(j, &w, u, units);
     }
     store(j, &w);
@@ -285,8 +344,9 @@ void dar_conv_slide_run(const dar_conv_slide *s, void *scratch)
     j.a = (char *)scratch + j.at_bytes;
     j.own = j.a + j.a_bytes;
     for (size_t i = 0; i < j.taps; i++) {
-        size_t tap = s->turned ? j.taps - 1 - i : i, kt = tap / c->kw / c->kh;
-        j.at[i] = kt * j.depth * j.ld + tap / c->kw % c->kh * j.pitch + tap % c->kw;
+        size_t tap = s->turned ? j.taps - 1 - i : i, kt = tap / c->kw / c->kh, y = tap / c->kw % c->kh, x = tap % c->kw;
+        size_t phase = y % c->stride * j.wide + x % c->stride;
+        j.at[i] = (kt * j.phases + phase) * j.depth * j.ld + y / c->stride * j.pitch + x / c->stride;
     }
     if (j.packs_a) dar_parallel_range(c->Cout, TURN, pack_weights, &j);
     dar_parallel(all, task, &j);

@@ -1,4 +1,4 @@
-/* conv_slide.h: convolution with strides of 1, without col.  Part of lib/conv.h.
+/* conv_slide.h: convolution without col, and without a stride in time.  Part of lib/conv.h.
  *
  * Rows of pixels are packed once, with zeros between them for the borders.  Then a tap of the kernel is the same pixels
  * read from another place: the tile slides over them (dar_tile.mm_taps). */
