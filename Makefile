@@ -50,8 +50,8 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
-.PHONY: all install everything headers test test-built check lint stress bench-kernels ulp fuzz fuzz-run deps clean
-.PHONY: help FORCE
+.PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit ulp fuzz fuzz-run
+.PHONY: deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
 all: $B/libdar.a $(PROGRAMS:%=$B/%) ## build the library and the programs
@@ -134,6 +134,10 @@ bench: deps ## speed of whole tasks, stage by stage: build/bench/data.csv
 	@$(MAKE) --no-print-directory $B/speed_data
 	@mkdir -p build/bench
 	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_data --output=build/bench/data.csv
+
+bench-dit: deps ## the 5B network with random weights: one evaluation; 13 GB, minutes; ARGS="--layers 4 --rank 16"
+	@$(MAKE) --no-print-directory $B/speed_dit
+	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_dit $(ARGS)
 
 everything: all $(TESTS:%=$B/%) $B/bench_kernels $(SPEED:%=$B/%) $B/ulp
 
