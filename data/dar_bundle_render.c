@@ -22,7 +22,8 @@
 
 static struct {
     const char *out, *camera, *camera_name, *trajectory, *animation, *families, *rgb, *reference, *prompt, *licence;
-    int64_t size[2], pose_size[2], frames, tracks, track_side;
+    const char *shade, *sun;
+    int64_t size[2], pose_size[2], frames, tracks, track_side, samples;
     double fps, near, fit, fov;
     int play, axes, up, faces, normals;
     bool list, world_f32, exr, overwrite;
@@ -92,6 +93,12 @@ static const dar_option options[] = {
       .help = "pictures of the same frames: PNG or JPEG files, or a video" },
     { .name = "reference", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.reference,
       .help = "picture of frame 0, PNG or JPEG, instead of --rgb" },
+    { .name = "shade", .placeholder = "LIGHTING", .type = DAR_ARG_TEXT, .target = &o.shade,
+      .help = "make pictures: day, studio, sunset, overcast, night or flat" },
+    { .name = "sun", .placeholder = "AZIMUTH,HEIGHT", .type = DAR_ARG_TEXT, .target = &o.sun,
+      .help = "where the sun of --shade stands, in degrees: 0,30 is before the scene, 90,30 at its right" },
+    { .name = "samples", .placeholder = "N", .type = DAR_ARG_INT, .target = &o.samples, .standard = "2",
+      .lo = 1, .hi = DAR_SHADE_SAMPLES, .help = "of --shade: N x N per pixel" },
     { .name = "prompt", .placeholder = "TEXT", .type = DAR_ARG_TEXT, .target = &o.prompt,
       .help = "words to keep with it" },
     { .name = "licence", .placeholder = "TEXT", .type = DAR_ARG_TEXT, .target = &o.licence,
@@ -111,6 +118,7 @@ struct job {
     uint8_t *reference;
     const char *trajectory; /* NULL: from a file or the scene */
     dar_render render;
+    dar_shade_config shade;
     dar_progress progress;
     char sha256[DAR_SHA256_TEXT];
     double begun, prepared; /* [s] */
@@ -150,6 +158,8 @@ static dar_status check_options(const dar_run *r, dar_err *e)
         return dar_fail(e, DAR_ERR_USAGE, "%s: expected one of --camera, --camera-name and --trajectory", name);
     if (o.rgb && o.reference)
         return dar_fail(e, DAR_ERR_USAGE, "%s: expected one of --rgb and --reference: the first frame is one", name);
+    if (o.shade && (o.rgb || o.reference))
+        return dar_fail(e, DAR_ERR_USAGE, "%s: expected one of --shade, --rgb and --reference", name);
     if (o.track_side % 2 == 0)
         return dar_fail(e, DAR_ERR_USAGE, "%s: --track-side: found %d, expected an odd number", name,
                         (int)o.track_side);
@@ -257,6 +267,30 @@ static dar_status load_pictures(struct job *j, dar_err *e)
     return dar_pictures_load(o.reference, width, height, j->reference, e);
 }
 
+static dar_status find_lights(struct job *j, dar_err *e)
+{
+    size_t kind;
+    if (!o.shade) return DAR_OK;
+    DAR_TRY(dar_lighting_find(o.shade, &kind, e));
+    if (o.size[0] * o.samples > DAR_RASTER_MAX_SIDE || o.size[1] * o.samples > DAR_RASTER_MAX_SIDE)
+        return dar_fail(e, DAR_ERR_USAGE, "--samples: found %d, expected at most %d samples along a side of --size",
+                        (int)o.samples, DAR_RASTER_MAX_SIDE);
+    j->shade = dar_shade_default((int)o.size[0], (int)o.size[1]);
+    j->shade.samples = (int)o.samples;
+    j->shade.lighting = dar_lighting_of(kind, false);
+    if (o.sun) {
+        double azimuth, height;
+        int end = 0;
+        if (sscanf(o.sun, "%lf,%lf%n", &azimuth, &height, &end) != 2 || o.sun[end] || !(fabs(azimuth) <= 360) ||
+            !(fabs(height) <= 90))
+            return dar_fail(e, DAR_ERR_USAGE, "--sun: found '%s', expected two angles such as 30,45", o.sun);
+        dar_lighting_aim(&j->shade.lighting, azimuth * M_PI / 180, height * M_PI / 180);
+    }
+    if (o.up == 1) dar_lighting_z_up(&j->shade.lighting);
+    j->render.shade = &j->shade;
+    return DAR_OK;
+}
+
 static void describe(struct job *j)
 {
     dar_render *r = &j->render;
@@ -280,7 +314,7 @@ static void describe(struct job *j)
     r->raster.normals = (dar_normals)o.normals;
     r->tracks = (size_t)o.tracks;
     r->track_side = (int)o.track_side;
-    r->bundle.rgb = j->pictures != NULL;
+    r->bundle.rgb = j->pictures || r->shade;
     r->bundle.world_f32 = o.world_f32;
     r->bundle.overwrite = o.overwrite;
     r->bundle.exr = o.exr;
@@ -352,6 +386,7 @@ static void tell_times(const struct job *j, dar_run *r, const dar_render_report 
         if (i == DAR_RENDER_DRAW && line[n - 1] != 'w') n += snprintf(line + n, sizeof line - (size_t)n, ")");
     }
     for (int k = 0; k < DAR_STAGES; k++) dar_json_write_number(&r->json, part[k], p->raster.seconds[k]);
+    for (int k = 0; k < DAR_SHADE_STAGES; k++) dar_json_write_number(&r->json, dar_shade_stage_name[k], p->shade[k]);
     dar_json_write_end(&r->json);
     dar_run_say(r, "%s", line);
 }
@@ -438,6 +473,7 @@ static dar_status work(struct job *j, dar_run *r, dar_err *e)
     dar_render_report report;
     j->render.bundle = dar_bundle_standard();
     DAR_TRY(parse_families(o.families, &j->render.bundle.families, e));
+    DAR_TRY(find_lights(j, e));
     DAR_TRY(load(j, e));
     DAR_TRY(load_pictures(j, e));
     describe(j);

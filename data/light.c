@@ -4,6 +4,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "lib/nearest.h"
 #include "lib/rng.h"
 
 #define ROWS    64 /* directions over which a sky is integrated */
@@ -57,6 +58,17 @@ const dar_lighting_kind dar_lighting_kinds[] = {
 /* clang-format on */
 const size_t dar_lighting_count = sizeof dar_lighting_kinds / sizeof *dar_lighting_kinds;
 
+dar_status dar_lighting_find(const char *name, size_t *kind, dar_err *e)
+{
+    dar_nearest near = dar_nearest_to(name);
+    for (*kind = 0; *kind < dar_lighting_count; ++*kind) {
+        if (strcmp(dar_lighting_kinds[*kind].name, name) == 0) return DAR_OK;
+        dar_nearest_try(&near, dar_lighting_kinds[*kind].name);
+    }
+    return dar_fail(e, DAR_ERR_USAGE, "lighting: found '%s', expected a name such as %s", name,
+                    near.best ? near.best : dar_lighting_kinds[0].name);
+}
+
 static void unit(double x[3])
 {
     double length = sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]);
@@ -76,6 +88,13 @@ void dar_lighting_z_up(dar_lighting *l)
     for (size_t i = 0; i < l->bulbs; i++) stand_up(l->bulb[i].at);
     stand_up(l->sky.glow_toward);
     stand_up(l->up);
+}
+
+void dar_lighting_aim(dar_lighting *l, double azimuth, double height)
+{
+    const double toward[3] = { cos(height) * sin(azimuth), sin(height), cos(height) * cos(azimuth) };
+    memcpy(l->sun[0].toward, toward, sizeof toward);
+    memcpy(l->sky.glow_toward, toward, sizeof toward);
 }
 
 dar_lighting dar_lighting_of(size_t kind, bool z_up)

@@ -13,6 +13,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "lib/status.h"
+
 #define DAR_LIGHTS_MOST 4 /* suns; bulbs */
 
 typedef struct dar_sun {
@@ -68,11 +70,18 @@ typedef struct dar_lighting_kind {
 extern const dar_lighting_kind dar_lighting_kinds[];
 extern const size_t dar_lighting_count;
 
+/* Fails, with the nearest name, for names that are not there. */
+dar_status dar_lighting_find(const char *name, size_t *kind, dar_err *e);
+
 /* A copy of row `kind`, with z up if so. */
 dar_lighting dar_lighting_of(size_t kind, bool z_up);
 
 /* Turn all directions from y up to z up. */
 void dar_lighting_z_up(dar_lighting *l);
+
+/* With y up: move the first sun, and the sky's glow with it.  Azimuth from z towards x, height above the level [rad].
+ */
+void dar_lighting_aim(dar_lighting *l, double azimuth, double height);
 
 /* ---------------------------------------------------------------- prepared */
 

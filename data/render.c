@@ -19,6 +19,7 @@ struct painter {
     dar_pose pose;
     dar_raster raster;
     dar_gbuffer g;
+    dar_shade shade;
     uint8_t *rgb;
     size_t tracks; /* found */
     dar_surface_point *point;
@@ -34,6 +35,16 @@ static bool wants(const dar_render *r, int family)
 static void *push(dar_arena *a, bool wanted, size_t n, size_t bytes)
 {
     return wanted ? dar_arena_push(a, dar_mul_size(n, bytes)) : NULL;
+}
+
+static void layout_shade(struct painter *p)
+{
+    const dar_render *r = p->r;
+    dar_shade_config c = *r->shade;
+    c.raster = r->raster;
+    memcpy(c.lo, r->meta.world.lo, sizeof c.lo);
+    memcpy(c.hi, r->meta.world.hi, sizeof c.hi);
+    dar_shade_init(&p->shade, r->clip.scene, &c, &p->arena);
 }
 
 static void layout(struct painter *p)
@@ -58,6 +69,7 @@ static void layout(struct painter *p)
         .mask = push(a, true, pixels, 1),
     };
     p->rgb = push(a, r->bundle.rgb, pixels, 3);
+    if (r->bundle.rgb && r->shade) layout_shade(p);
     p->point = push(a, points, points, sizeof *p->point);
     p->color = push(a, points, points, 3);
     p->depth = push(a, points, points, sizeof(float));
@@ -109,6 +121,11 @@ static dar_status draw(struct painter *p, size_t frame, bool again, dar_err *e)
     return DAR_OK;
 }
 
+static void shade(struct painter *p, size_t frame)
+{
+    dar_shade_draw(&p->shade, &p->pose, &p->r->cameras->view[frame], p->rgb);
+}
+
 static void follow(struct painter *p, size_t frame, bool copied)
 {
     const dar_render *r = p->r;
@@ -134,7 +151,8 @@ static dar_status add_frame(struct painter *p, size_t frame, dar_bundle_writer *
     seconds[DAR_RENDER_DRAW] += lap(&mark);
     if (p->point) follow(p, frame, f.copied);
     seconds[DAR_RENDER_TRACKS] += lap(&mark);
-    if (p->rgb) DAR_TRY(r->picture(r->ctx, frame, p->rgb, e));
+    if (r->bundle.rgb && !r->shade) DAR_TRY(r->picture(r->ctx, frame, p->rgb, e));
+    if (r->bundle.rgb && r->shade) shade(p, frame);
     seconds[DAR_RENDER_PICTURE] += lap(&mark);
     DAR_TRY(dar_bundle_add(w, &f, e));
     seconds[DAR_RENDER_WRITE] += lap(&mark);
@@ -175,6 +193,7 @@ static dar_status write_frames(struct painter *p, dar_bundle_writer *w, double *
 static void finish(struct painter *p, dar_render_report *report)
 {
     report->raster = p->raster.stats;
+    memcpy(report->shade, p->shade.seconds, sizeof report->shade);
     report->tracks = p->tracks;
     report->memory = p->arena.peak;
     dar_arena_free(&p->arena);
@@ -207,7 +226,11 @@ dar_status dar_render_try(const dar_render *r, size_t frames, dar_render_report 
     *report = (dar_render_report){ 0 };
     dar_status s = init(&p, r, e);
     double mark = dar_log_clock();
-    for (size_t i = 0; s == DAR_OK && i < frames; i++) s = draw(&p, i * (r->clip.frames - 1) / frames, false, e);
+    for (size_t i = 0; s == DAR_OK && i < frames; i++) {
+        size_t frame = i * (r->clip.frames - 1) / frames;
+        s = draw(&p, frame, false, e);
+        if (s == DAR_OK && r->bundle.rgb && r->shade) shade(&p, frame);
+    }
     report->seconds[DAR_RENDER_DRAW] = lap(&mark);
     finish(&p, report);
     return s;

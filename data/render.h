@@ -11,6 +11,7 @@
 #include "data/bundle.h"
 #include "data/clip.h"
 #include "data/raster.h"
+#include "data/shade.h"
 
 typedef struct dar_render {
     dar_clip clip;
@@ -20,6 +21,10 @@ typedef struct dar_render {
     dar_bundle_meta meta;      /* world, box and what is known of the origin; the rest is filled in */
     size_t tracks;             /* points wanted */
     int track_side;            /* of their squares in the map [px], odd */
+
+    /* If bundle.rgb: pictures are made as this says, with the raster's size, faces and blend_cutoff, and shadows fall
+     * within meta.world; NULL: they are asked for. */
+    const dar_shade_config *shade;
 
     /* The picture of a frame, [H, W, 3], if bundle.rgb; each frame once, in order. */
     dar_status (*picture)(void *ctx, size_t frame, uint8_t *rgb, dar_err *e);
@@ -33,7 +38,7 @@ typedef struct dar_render {
 typedef enum dar_render_stage {
     DAR_RENDER_DRAW,    /* pose and raster; their parts: report.raster */
     DAR_RENDER_TRACKS,  /* follow points, draw their map */
-    DAR_RENDER_PICTURE, /* read what the person gave */
+    DAR_RENDER_PICTURE, /* read what the person gave, or shade; its parts: report.shade */
     DAR_RENDER_WRITE,   /* encode, deflate, write */
     DAR_RENDER_STAGES
 } dar_render_stage;
@@ -42,8 +47,9 @@ extern const char *const dar_render_stage_name[];
 typedef struct dar_render_report {
     double seconds[DAR_RENDER_STAGES];
     dar_raster_stats raster;
-    size_t tracks; /* points found */
-    size_t memory; /* [bytes] planned */
+    double shade[DAR_SHADE_STAGES]; /* [s] */
+    size_t tracks;                  /* points found */
+    size_t memory;                  /* [bytes] planned */
 } dar_render_report;
 
 /* Write the bundle, whole or not at all. */

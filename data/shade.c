@@ -10,11 +10,18 @@
 
 const char *const dar_shade_stage_name[] = { "samples", "shadows", "light" };
 
+/* Texels of shadow maps are about as large as pixels when the scene fills the picture. */
+static int shadow_side(int width, int height)
+{
+    int side = 2 * (width < height ? width : height);
+    return side < 256 ? 256 : side > 2048 ? 2048 : side;
+}
+
 dar_shade_config dar_shade_default(int width, int height)
 {
     return (dar_shade_config){ .raster = dar_raster_default(width, height),
                                .samples = 2,
-                               .shadow_side = 768,
+                               .shadow_side = shadow_side(width, height),
                                .lighting = dar_lighting_of(0, false) };
 }
 
