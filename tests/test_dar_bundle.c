@@ -329,6 +329,39 @@ static void pictures(void **state)
     dar_bundle_close(b);
 }
 
+/* Pictures of the scene itself: its surfaces where the mask is, the lighting's white elsewhere, the same for any number
+ * of threads. */
+static void shaded(void **state)
+{
+    (void)state;
+    static uint8_t rgb[3 * PIXELS], reference[3 * PIXELS];
+    static float mask[PIXELS];
+    dar_err e;
+    GOOD("render", SCENE, "-o", "lit", "--shade", "flat", "--sun", "30,40", "--samples", "1", "--threads", "2");
+    GOOD("render", SCENE, "-o", "lit1", "--shade", "flat", "--sun", "30,40", "--samples", "1", "--threads", "1");
+    dar_bundle *a = opened("lit"), *b = opened("lit1");
+    assert_true(a->rgb && a->reference);
+    for (size_t t = 0; t < T; t++) {
+        size_t surface = 0;
+        assert_int_equal(dar_bundle_rgb(a, t, rgb, &e), DAR_OK);
+        assert_int_equal(dar_bundle_rgb(b, t, reference, &e), DAR_OK);
+        assert_memory_equal(rgb, reference, sizeof rgb);
+        assert_int_equal(dar_bundle_values(a, DAR_FAMILY_MASK, t, mask, &e), DAR_OK);
+        for (size_t i = 0; i < PIXELS; i++) {
+            surface += mask[i] > 0;
+            bool white = rgb[3 * i] == 238 && rgb[3 * i + 1] == 238 && rgb[3 * i + 2] == 238;
+            CHECK(white == (mask[i] == 0), "frame %zu: pixel %zu is %d %d %d, mask %g", t, i, rgb[3 * i],
+                  rgb[3 * i + 1], rgb[3 * i + 2], mask[i]);
+        }
+        CHECK(surface > PIXELS / 50, "only %zu pixels of surfaces", surface);
+    }
+    assert_int_equal(dar_bundle_rgb(a, 0, rgb, &e), DAR_OK);
+    assert_int_equal(dar_bundle_reference(a, reference, &e), DAR_OK);
+    assert_memory_equal(rgb, reference, sizeof rgb);
+    dar_bundle_close(a);
+    dar_bundle_close(b);
+}
+
 /* A camera that stands before a scene at rest: one frame is drawn, the others are copies. */
 static void still(void **state)
 {
@@ -422,6 +455,9 @@ static void refusals(void **state)
         { { "render", "scene.glb", "-o", "no", "--families", "wrold" }, "found 'wrold'" },
         { { "render", "scene.glb", "-o", "no", "--rgb", "." }, "PNG and JPEG files, expected 81" },
         { { "render", "scene.glb", "-o", "no", "--reference", "junk.glb" }, "junk.glb: neither a PNG nor a JPEG" },
+        { { "render", "scene.glb", "-o", "no", "--shade", "studo" }, "found 'studo', expected a name such as studio" },
+        { { "render", "scene.glb", "-o", "no", "--shade", "day", "--sun", "north" }, "--sun: found 'north'" },
+        { { "render", "scene.glb", "-o", "no", "--shade", "day", "--rgb", "." }, "expected one of --shade, --rgb" },
         { { "render", "scene.glb", "-o", "no", "--track-side", "2" }, "found 2, expected an odd number" },
         { { "render", "scene.glb", "-o", "nowhere/no" }, "nowhere/no" },
         { { "render", "scene.glb", "-o", "scene.glb" }, "scene.glb: is there already" },
@@ -524,6 +560,7 @@ int main(int argc, char **argv)
         cmocka_unit_test(checked),
         cmocka_unit_test(any_threads),
         cmocka_unit_test(pictures),
+        cmocka_unit_test(shaded),
         cmocka_unit_test(still),
         cmocka_unit_test(conversions),
         cmocka_unit_test(refusals),
