@@ -196,6 +196,7 @@ static dar_status convert(const struct files *f, const char *path, const dar_con
 
     DAR_TRY(open_file(f, 0, &x, name, e));
     o.families = dar_bundle_exr_families(x);
+    o.world_f32 = true; /* as the files have it: they may have been rounded before */
     o.overwrite = c->overwrite;
     m.width = (int)dar_exr_width(x), m.height = (int)dar_exr_height(x);
     m.frames = *frames = (size_t)f->count;
