@@ -73,11 +73,6 @@ static inline vf v_sqrt(vf x)
     return _mm256_sqrt_ps(x);
 }
 
-static inline vf v_round(vf x)
-{
-    return _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-}
-
 static inline vf v_abs(vf x)
 {
     return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), x);
@@ -98,13 +93,39 @@ static inline vf v_select(vm m, vf yes, vf no)
     return _mm256_blendv_ps(no, yes, m);
 }
 
-/* x 2^n for whole n in [-250, 250], rounded once: two factors that are normal numbers. */
+/* x 2^floor(n) for n in [-250, 250], rounded once: two factors that are normal numbers. */
 static inline vf v_scale(vf x, vf n)
 {
-    __m256i e = _mm256_cvtps_epi32(n), half = _mm256_srai_epi32(e, 1), one = _mm256_set1_epi32(127);
+    __m256i e = _mm256_cvtps_epi32(_mm256_floor_ps(n)), half = _mm256_srai_epi32(e, 1), one = _mm256_set1_epi32(127);
     __m256i a = _mm256_slli_epi32(_mm256_add_epi32(half, one), 23);
     __m256i b = _mm256_slli_epi32(_mm256_add_epi32(_mm256_sub_epi32(e, half), one), 23);
     return x * _mm256_castsi256_ps(a) * _mm256_castsi256_ps(b);
+}
+
+/* 2^f for the fraction f of n, which the last three bits count. */
+static inline vf v_power(vf n)
+{
+    const __m256 t = _mm256_setr_ps(1, 0x1.172b84p+0f, 0x1.306fep+0f, 0x1.4bfdaep+0f, 0x1.6a09e6p+0f, 0x1.8ace54p+0f,
+                                    0x1.ae89fap+0f, 0x1.d5818ep+0f);
+    return _mm256_permutevar8x32_ps(t, _mm256_castps_si256(n));
+}
+
+/* What rounding took from v_power and v_power_sunk, relative to them. */
+static inline vf v_power_rest(vf n)
+{
+    const __m256 t = _mm256_setr_ps(0, -0x1.9c0c22p-27f, 0x1.125002p-25f, -0x1.0a355p-25f, 0x1.26055cp-26f,
+                                    0x1.67a1cap-28f, -0x1.f9c304p-27f, -0x1.a5217cp-28f);
+    return _mm256_permutevar8x32_ps(t, _mm256_castps_si256(n));
+}
+
+/* 2^(n - 64), a normal number: the bits above the fraction go to the exponent, the fraction's own, which come along,
+ * are taken off beforehand. */
+static inline vf v_power_sunk(vf n)
+{
+    const __m256i t = _mm256_setr_epi32(0x1f800000, 0x1f7b95c2, 0x1f7837f0, 0x1f75fed7, 0x1f7504f3, 0x1f75672a,
+                                        0x1f7744fd, 0x1f7ac0c7);
+    __m256i u = _mm256_castps_si256(n);
+    return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_permutevar8x32_epi32(t, u), _mm256_slli_epi32(u, 20)));
 }
 
 static inline vf v_even(vf x)

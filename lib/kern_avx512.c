@@ -69,11 +69,6 @@ static inline vf v_sqrt(vf x)
     return _mm512_sqrt_ps(x);
 }
 
-static inline vf v_round(vf x)
-{
-    return _mm512_roundscale_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-}
-
 static inline vf v_abs(vf x)
 {
     return _mm512_abs_ps(x);
@@ -94,10 +89,40 @@ static inline vf v_select(vm m, vf yes, vf no)
     return _mm512_mask_blend_ps(m, no, yes);
 }
 
-/* x 2^n for whole n, rounded once. */
+/* x 2^floor(n), rounded once. */
 static inline vf v_scale(vf x, vf n)
 {
     return _mm512_scalef_ps(x, n);
+}
+
+/* 2^f for the fraction f of n, which the last four bits count. */
+static inline vf v_power(vf n)
+{
+    const __m512 t = _mm512_setr_ps(1, 0x1.0b5586p+0f, 0x1.172b84p+0f, 0x1.2387a6p+0f, 0x1.306fep+0f, 0x1.3dea64p+0f,
+                                    0x1.4bfdaep+0f, 0x1.5ab07ep+0f, 0x1.6a09e6p+0f, 0x1.7a1148p+0f, 0x1.8ace54p+0f,
+                                    0x1.9c4918p+0f, 0x1.ae89fap+0f, 0x1.c199bep+0f, 0x1.d5818ep+0f, 0x1.ea4afap+0f);
+    return _mm512_permutexvar_ps(_mm512_castps_si512(n), t);
+}
+
+/* What rounding took from v_power and v_power_sunk, relative to them. */
+static inline vf v_power_rest(vf n)
+{
+    const __m512 t =
+        _mm512_setr_ps(0, 0x1.8d96d4p-25f, -0x1.9c0c22p-27f, 0x1.964904p-25f, 0x1.125002p-25f, 0x1.370be4p-25f,
+                       -0x1.0a355p-25f, -0x1.00d8acp-27f, 0x1.26055cp-26f, -0x1.05cb44p-25f, 0x1.67a1cap-28f,
+                       0x1.a3b5e4p-28f, -0x1.f9c304p-27f, -0x1.6961b4p-28f, -0x1.a5217cp-28f, 0x1.61428ep-28f);
+    return _mm512_permutexvar_ps(_mm512_castps_si512(n), t);
+}
+
+/* 2^(n - 64), a normal number: the bits above the fraction go to the exponent, the fraction's own, which come along,
+ * are taken off beforehand. */
+static inline vf v_power_sunk(vf n)
+{
+    const __m512i t = _mm512_setr_epi32(0x1f800000, 0x1f7daac3, 0x1f7b95c2, 0x1f79c3d3, 0x1f7837f0, 0x1f76f532,
+                                        0x1f75fed7, 0x1f75583f, 0x1f7504f3, 0x1f7508a4, 0x1f75672a, 0x1f76248c,
+                                        0x1f7744fd, 0x1f78ccdf, 0x1f7ac0c7, 0x1f7d257d);
+    __m512i u = _mm512_castps_si512(n);
+    return _mm512_castsi512_ps(_mm512_add_epi32(_mm512_permutexvar_epi32(u, t), _mm512_slli_epi32(u, 19)));
 }
 
 static inline vf v_even(vf x)
