@@ -233,6 +233,27 @@ static dar_val *up_level(dar_tape *t, const struct pass *p, const dar_vae_level 
     return dar_add(t, x, dar_dup_up(t, in, l->out, ft, 2, begins(p) ? ft - 1 : 0));
 }
 
+struct level {
+    struct pass p;
+    const dar_vae_level *l;
+};
+
+static dar_val *up_level_of(dar_tape *t, void *arg, dar_val *const *in)
+{
+    const struct level *a = arg;
+    return up_level(t, &a->p, a->l, in[0]);
+}
+
+/* A level of which only the result stays: what it makes on the way is larger. */
+static dar_val *up_level_alone(dar_tape *t, const struct pass *p, const dar_vae_level *l, dar_val *x)
+{
+    dar_shape s = x->x.shape;
+    s.d[1] = l->out;
+    if (l->halve_time) s.d[2] = 2 * s.d[2] - begins(p);
+    if (l->halve) s.d[3] *= 2, s.d[4] *= 2;
+    return dar_segment(t, up_level_of, &(struct level){ *p, l }, &x, 1, x->x.dtype, s);
+}
+
 static dar_val *decoder_begin(dar_tape *t, const struct pass *p, dar_val *z)
 {
     const dar_vae *v = p->v;
@@ -338,13 +359,13 @@ dar_status dar_vae_decode_next(dar_vae_stream *s, dar_tape *t, dar_val *z, dar_v
 
     dar_tape_place begin = dar_tape_mark(t);
     dar_val *x = decoder_begin(t, &p, z);
-    for (int i = 0; i < last; i++) x = up_level(t, &p, &v->decoder.level[i], x);
+    for (int i = 0; i < last; i++) x = up_level_alone(t, &p, &v->decoder.level[i], x);
     int64_t frames = frames_of(x), first = s->pieces ? 1 + (s->pieces - 1) * dar_vae_shrink_time(&v->c) : 0;
     dar_status status = DAR_OK;
     for (int64_t f = 0; f < frames && status == DAR_OK; f++) {
         dar_tape_place m = dar_tape_mark(t);
         dar_val *y = dar_contiguous(t, dar_slice(t, x, 2, f, 1));
-        for (int i = last; i < v->c.levels; i++) y = up_level(t, &p, &v->decoder.level[i], y);
+        for (int i = last; i < v->c.levels; i++) y = up_level_alone(t, &p, &v->decoder.level[i], y);
         y = decoder_end(t, &p, y);
         if (!t->arena->plan) dar_vae_clamp(&y->x);
         if (sink) status = sink(ctx, &y->x, first + f, e);

@@ -464,7 +464,7 @@ static void planned_memory(void **state)
                 plan_pieces(&n, (dar_vae_side)side, &tilings[k], gb);
                 printf("%s 9 frames of 480 x 832 in %s, tiles of %lld: weights %.2f, kept %.2f, step %.2f GB\n",
                        sides[side], dar_dtype_name(types[i]), (long long)tilings[k].size, gb[0], gb[1], gb[2]);
-                CHECK(gb[0] + gb[1] + gb[2] < 20, "%.1f GB", gb[0] + gb[1] + gb[2]);
+                CHECK(gb[0] + gb[1] + gb[2] < 8.5, "%.1f GB", gb[0] + gb[1] + gb[2]);
                 net_free(&n);
             }
 }
