@@ -80,33 +80,44 @@ static dar_box bounds(const float *x, size_t n)
     return b;
 }
 
-dar_status dar_clip_survey(const dar_clip *c, dar_box *box, dar_world *world, dar_err *e)
+/* Pose every frame: box [frames, instances] and all [frames]; NULL: not wanted. */
+static dar_status survey(const dar_clip *c, dar_box *box, dar_box *all, dar_err *e)
 {
     const dar_scene *s = c->scene;
     struct poses p = { 0 };
-    dar_box all = nowhere;
-    dar_world_init(world);
     if (!s->vertices) return dar_fail(e, DAR_ERR_FORMAT, "%s: found no triangles in the scene", s->path);
     dar_status status = poses_init(&p, s, e);
     for (size_t t = 0; status == DAR_OK && t < c->frames; t++) {
         status = dar_pose_at(&p.pose, c->animation, dar_clip_time(c, t), e);
         if (status != DAR_OK) break;
         dar_pose_vertices(&p.pose, p.position, NULL, true);
-        box[t] = nowhere;
+        if (all) all[t] = nowhere;
         for (size_t i = 0; i < s->instances; i++) {
             const dar_instance *in = &s->instance[i];
             if (p.pose.changed[i]) p.instance[i] = bounds(p.position + 3 * in->vertex, s->mesh[in->mesh].vertices);
-            grow(&box[t], p.instance[i].lo, p.instance[i].hi);
+            if (all) grow(&all[t], p.instance[i].lo, p.instance[i].hi);
+            if (box) box[t * s->instances + i] = p.instance[i];
         }
-        grow(&all, box[t].lo, box[t].hi);
-    }
-    if (status == DAR_OK) {
-        memcpy(world->lo, all.lo, sizeof all.lo);
-        memcpy(world->hi, all.hi, sizeof all.hi);
-        dar_world_finish(world);
     }
     dar_arena_free(&p.arena);
     return status == DAR_ERR_NUMERIC ? DAR_ERR_FORMAT : status; /* a file that cannot be posed is bad input */
+}
+
+dar_status dar_clip_boxes(const dar_clip *c, dar_box *box, dar_err *e)
+{
+    return survey(c, box, NULL, e);
+}
+
+dar_status dar_clip_survey(const dar_clip *c, dar_box *box, dar_world *world, dar_err *e)
+{
+    dar_box all = nowhere;
+    dar_world_init(world);
+    DAR_TRY(survey(c, NULL, box, e));
+    for (size_t t = 0; t < c->frames; t++) grow(&all, box[t].lo, box[t].hi);
+    memcpy(world->lo, all.lo, sizeof all.lo);
+    memcpy(world->hi, all.hi, sizeof all.hi);
+    dar_world_finish(world);
+    return DAR_OK;
 }
 
 /* ---------------------------------------------------------------- cameras */

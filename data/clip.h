@@ -33,6 +33,9 @@ double dar_clip_time(const dar_clip *c, size_t frame); /* [s] of the animation *
  * triangles, or cannot be posed. */
 dar_status dar_clip_survey(const dar_clip *c, dar_box *box, dar_world *world, dar_err *e);
 
+/* The same by instance: box [frames, instances]. */
+dar_status dar_clip_boxes(const dar_clip *c, dar_box *box, dar_err *e);
+
 /* The path of the scene's camera of that name, or number from 0; NULL: the first.  The caller owes one dar_camera_free,
  * also after a failure. */
 dar_status dar_clip_camera(const dar_clip *c, const char *name, int width, int height, dar_camera_path *p, dar_err *e);
