@@ -9,6 +9,7 @@ extern const dar_program dar_command_render;
 extern const dar_program dar_command_check;
 extern const dar_program dar_command_show;
 extern const dar_program dar_command_convert;
+extern const dar_program dar_command_synth;
 
 /* ---------------------------------------------------------------- EXR, for convert */
 

@@ -11,6 +11,9 @@
 #define PATHS  24   /* camera paths */
 #define STILLS 9    /* things beside the animated ones, at most */
 
+#define GROUND_DEPTH   0.3  /* [m] */
+#define LARGEST_GROUND 1.43 /* half its longest side, in radii of the area */
+
 dar_synth_plan dar_synth_standard(void)
 {
     return (dar_synth_plan){ .set = DAR_ASSET_TRAIN, .width = 224, .height = 128, .frames = 17, .fps = 16 };
@@ -135,6 +138,7 @@ static double area_radius(const struct work *w)
         sum += r * (r + way);
         most = fmax(most, r + 0.6 * way);
     }
+    if (w->plan->reach > 0) return w->plan->reach / LARGEST_GROUND;
     return fmax(1.25 * most, 1.45 * sqrt(sum));
 }
 
@@ -202,7 +206,8 @@ static void add_ground(struct work *w)
 {
     dar_maker *m = &w->maker;
     dar_dice *d = &w->dice;
-    double r = w->out->radius * dar_dice_in(d, 1.06, 1.3), thick = dar_dice_in(d, 0.08, 0.3), top = -0.004;
+    double r = w->out->radius * dar_dice_in(d, 1.06, 1.3), thick = dar_dice_in(d, 0.08, GROUND_DEPTH - 0.01),
+           top = -0.004;
     size_t form = dar_dice_below(d, 3);
     m->look = dar_dice_for(w->plan->look, "ground", 0);
     const dar_paint_style style = { .palette = DAR_NONE, .contrast = dar_dice_in(&m->look, 0.35, 0.9) };
@@ -273,7 +278,9 @@ static dar_status find_path(struct work *w, dar_err *e)
     all.boxes = p->frames, all.box = o->box, all.width = p->width, all.height = p->height;
     if (!p->path) all.fov = dar_dice_in(&d, 28, 50) * M_PI / 180;
     dar_stage things = all;
+    const dar_box around = { { -p->reach, -GROUND_DEPTH, -p->reach }, { p->reach, p->reach / 2, p->reach } };
     things.box = cover_things(w);
+    if (p->reach > 0) things.box = &around, things.boxes = 1;
     DAR_TRY(dar_camera_init(&o->cameras, p->frames, e));
     for (o->paths = 0; o->paths < PATHS; o->paths++) {
         size_t frame;
@@ -281,7 +288,7 @@ static dar_status find_path(struct work *w, dar_err *e)
         if (dar_trajectory_path(&o->path, &things, &o->cameras, NULL) == DAR_OK &&
             dar_trajectory_check(&o->cameras, &all, &frame) == DAR_PATH_SAFE)
             return DAR_OK;
-        if (dar_trajectory_path(&o->path, &all, &o->cameras, NULL) == DAR_OK) return DAR_OK;
+        if (p->reach <= 0 && dar_trajectory_path(&o->path, &all, &o->cameras, NULL) == DAR_OK) return DAR_OK;
     }
     return dar_fail(e, DAR_ERR_CHECK, "seed %llu: found no safe camera path in %d", (unsigned long long)p->view, PATHS);
 }

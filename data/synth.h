@@ -26,7 +26,8 @@ typedef struct dar_synth_plan {
     dar_asset_set set;
     const dar_asset_kind *subject;   /* NULL: drawn from the set */
     const dar_trajectory_kind *path; /* NULL: drawn from the archetypes, all but those of the benchmark */
-    int width, height;               /* [px] */
+    double reach; /* > 0: the camera goes around this box, whatever is in it: x, z to +-reach, y to reach / 2 [m] */
+    int width, height; /* [px] */
     size_t frames;
     double fps;
 } dar_synth_plan;
