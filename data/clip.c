@@ -53,6 +53,7 @@ static dar_status poses_init(struct poses *p, const dar_scene *s, dar_err *e)
     DAR_TRY(dar_arena_init_plan(&p->arena, "poses", e));
     poses_layout(p, s);
     size_t bytes = p->arena.peak;
+    dar_arena_free(&p->arena);
     DAR_TRY(dar_arena_init(&p->arena, "poses", bytes, e));
     poses_layout(p, s);
     return DAR_OK;

@@ -96,6 +96,7 @@ static dar_status init(struct painter *p, const dar_render *r, dar_err *e)
     DAR_TRY(dar_arena_init_plan(&p->arena, "render", e));
     layout(p);
     size_t bytes = p->arena.peak;
+    dar_arena_free(&p->arena);
     DAR_TRY(dar_arena_init(&p->arena, "render", bytes, e));
     layout(p);
     return DAR_OK;
