@@ -7,10 +7,9 @@ static const struct {
     const dar_asset_kind *row;
     const size_t *rows;
 } table[] = {
-    { dar_asset_creatures, &dar_asset_creature_count },
-    { dar_asset_vehicles, &dar_asset_vehicle_count },
-    { dar_asset_machines, &dar_asset_machine_count },
-    { dar_asset_softs, &dar_asset_soft_count },
+    { dar_asset_creatures, &dar_asset_creature_count }, { dar_asset_vehicles, &dar_asset_vehicle_count },
+    { dar_asset_machines, &dar_asset_machine_count },   { dar_asset_softs, &dar_asset_soft_count },
+    { dar_asset_interiors, &dar_asset_interior_count },
 };
 
 size_t dar_asset_kinds(void)

@@ -6,9 +6,9 @@
 
 /* Tables of the files, one row a kind. */
 extern const dar_asset_kind dar_asset_creatures[], dar_asset_vehicles[], dar_asset_machines[], dar_asset_softs[],
-    dar_asset_objects[];
+    dar_asset_interiors[], dar_asset_objects[];
 extern const size_t dar_asset_creature_count, dar_asset_vehicle_count, dar_asset_machine_count, dar_asset_soft_count,
-    dar_asset_object_count;
+    dar_asset_interior_count, dar_asset_object_count;
 
 /* A paint of one of the patterns: DAR_PAINT(DOTS) | DAR_PAINT(PLAIN). */
 #define DAR_PAINT(name) (1u << DAR_PATTERN_##name)

@@ -176,8 +176,8 @@ static void add_vertices(dar_maker *m, const dar_sheet_shape *s)
             size_t i = b->vertices++;
             s->point(s->ctx, column, row, x);
             for (int k = 0; k < 3; k++) b->position[i][k] = (float)(dar_vec_dot(m->at + 4 * k, x) + m->at[4 * k + 3]);
-            b->uv[i][0] = (float)(u * s->repeat_u);
-            b->uv[i][1] = (float)(v * s->repeat_v);
+            b->uv[i][0] = (float)((s->planar ? x[0] : u) * s->repeat_u);
+            b->uv[i][1] = (float)((s->planar ? x[2] : v) * s->repeat_v);
             b->weld[i] = (uint32_t)i;
             if (s->closed_u && c == s->columns) b->weld[i] = (uint32_t)begin;
             if (s->closed_v && r == s->rows) b->weld[i] = b->weld[first + c];

@@ -52,6 +52,7 @@ typedef struct dar_maker {
     size_t frames;
     double fps;
     dar_dice look; /* of the paints: others give the same things in other colours */
+    bool bare;     /* paints are left out: geometry alone is wanted */
 
     /* In force for the shapes that follow. */
     double at[12];  /* shape to mesh */
@@ -100,7 +101,8 @@ void dar_make_target(dar_maker *m, dar_make_bend *where, const void *ctx);
 typedef struct dar_sheet_shape {
     size_t rows, columns; /* quads along v, along u */
     bool closed_u, closed_v;
-    double repeat_u, repeat_v; /* of the texture */
+    double repeat_u, repeat_v; /* of the texture; planar: per metre of x and z */
+    bool planar;               /* the texture lies level */
     void (*point)(const void *ctx, double u, double v, double x[3]);
     void (*joints)(const void *ctx, double u, double v, int joint[2],
                    double *second); /* NULL: m->joint; share of [1] */
@@ -130,7 +132,7 @@ void dar_make_gear(dar_maker *m, size_t teeth, double radius, double depth, doub
 void dar_make_rock(dar_maker *m, double radius, double rough, uint64_t seed);
 /* In x and z, about the origin, upwards; lying also as a disc. */
 void dar_make_plate(dar_maker *m, double x, double z, size_t quads);
-void dar_make_disc(dar_maker *m, double radius);
+void dar_make_disc(dar_maker *m, double radius); /* its texture lies level, too */
 
 /* ---------------------------------------------------------------- paints */
 

@@ -5,9 +5,9 @@
 
 #include "lib/thread.h"
 
-#define SIDE    DAR_MAKE_SIDE
-#define LATTICE 16 /* cells of noise across a texture, at its finest level but two */
-#define TABLE   1024
+#define SIDE  DAR_MAKE_SIDE
+#define GRAIN 32 /* cells of fine noise across a texture */
+#define TABLE 1024
 
 /* sRGB: two that fill, one that accents, one that is dark or light. */
 static const uint32_t palettes[][4] = {
@@ -139,7 +139,7 @@ static void paint_row(void *ctx, size_t row, int thread)
     (void)thread;
     for (size_t c = 0; c < SIDE; c++) {
         double u = ((double)c + 0.5) / SIDE, x = fmin(fmax(color_at(p, u, v), 0), 3);
-        double light = 1 + p->grain * clouds(p, u, v, LATTICE);
+        double light = 1 + p->grain * lattice(p, u, v, GRAIN);
         int i = x < 2 ? (int)x : 2;
         uint8_t *y = p->rgba + 4 * (row * SIDE + c);
         for (int k = 0; k < 3; k++)
@@ -191,6 +191,10 @@ int dar_make_paint(dar_maker *m, const dar_paint_style *style)
     dar_dice *d = &m->look;
     struct paint p = { .pattern = draw_pattern(d, style->patterns) };
     draw_colors(&p, d, style);
+    dar_material material = {
+        .name = "paint", .color = { 1, 1, 1, 1 }, .image = DAR_NONE, .double_sided = style->double_sided
+    };
+    if (m->bare) return add_material(m, material);
     p.n = 1 + (int)dar_dice_below(d, 3);
     p.k = 1 + (int)dar_dice_below(d, 3);
     p.share = dar_dice_in(d, 0.3, 0.6);
@@ -200,10 +204,8 @@ int dar_make_paint(dar_maker *m, const dar_paint_style *style)
     p.rgba = dar_arena_push(&s->memory, (size_t)4 * SIDE * SIDE);
     dar_parallel(SIDE, paint_row, &p);
     s->image[s->images] = (dar_image){ SIDE, SIDE, p.rgba };
-    return add_material(m, (dar_material){ .name = "paint",
-                                           .color = { 1, 1, 1, 1 },
-                                           .image = (int)s->images++,
-                                           .double_sided = style->double_sided });
+    material.image = (int)s->images++;
+    return add_material(m, material);
 }
 
 static double linear(double x)

@@ -195,7 +195,16 @@ void dar_make_lathe(dar_maker *m, const double (*profile)[2], size_t n)
 
 void dar_make_disc(dar_maker *m, double radius)
 {
-    dar_make_lathe(m, (const double[][2]){ { radius, 0 }, { 0, 0 } }, 2);
+    const double rim[2][2] = { { radius, 0 }, { 0, 0 } };
+    struct profile p = { rim, 2 };
+    dar_make_sheet(m, &(dar_sheet_shape){ .rows = 1,
+                                          .columns = 3 * FINE,
+                                          .closed_u = true,
+                                          .repeat_u = m->density,
+                                          .repeat_v = m->density,
+                                          .planar = true,
+                                          .point = lathe_point,
+                                          .ctx = &p });
 }
 
 void dar_make_cone(dar_maker *m, double bottom, double top, double height)

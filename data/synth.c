@@ -7,7 +7,7 @@
 #include "data/affine.h"
 
 #define MARGIN 0.08 /* [m] between two things */
-#define TRIES  48   /* places, or ways, of one thing */
+#define TRIES  96   /* places, or ways, of one thing */
 #define PATHS  24   /* camera paths */
 #define STILLS 9    /* things beside the animated ones, at most */
 
@@ -33,7 +33,6 @@ struct work {
     dar_maker maker;
     dar_dice dice;
     dar_place_thing place[DAR_SYNTH_THINGS];
-    size_t floor; /* first node that is of no thing */
 };
 
 static void *room(struct work *w, size_t n, size_t bytes)
@@ -43,11 +42,12 @@ static void *room(struct work *w, size_t n, size_t bytes)
 
 /* ---------------------------------------------------------------- things */
 
-static const dar_asset_kind *draw_kind(dar_asset_set set, dar_dice *d)
+/* A room is a subject, never beside one. */
+static const dar_asset_kind *draw_kind(dar_asset_set set, bool subject, dar_dice *d)
 {
     for (;;) {
         const dar_asset_kind *k = dar_asset_at(dar_dice_below(d, dar_asset_kinds()));
-        if (k->set == set) return k;
+        if (k->set == set && (subject || strcmp(k->family, "interior") != 0)) return k;
     }
 }
 
@@ -68,11 +68,11 @@ static void add_thing(struct work *w, const dar_asset_kind *kind, size_t number)
 static void add_things(struct work *w)
 {
     dar_dice *d = &w->dice;
-    const dar_asset_kind *subject = w->plan->subject ? w->plan->subject : draw_kind(w->plan->set, d);
+    const dar_asset_kind *subject = w->plan->subject ? w->plan->subject : draw_kind(w->plan->set, true, d);
     bool alone = strcmp(subject->family, "interior") == 0;
     size_t others = dar_dice_below(d, 3), stills = 1 + dar_dice_below(d, STILLS - 2), n = 0;
     add_thing(w, subject, n++);
-    for (size_t i = 0; i < others && !alone; i++) add_thing(w, draw_kind(w->plan->set, d), n++);
+    for (size_t i = 0; i < others && !alone; i++) add_thing(w, draw_kind(w->plan->set, false, d), n++);
     for (size_t i = 0; i < stills && !alone; i++)
         add_thing(w, dar_asset_still_at(dar_dice_below(d, dar_asset_stills())), n++);
 }
@@ -139,7 +139,7 @@ static double area_radius(const struct work *w)
         most = fmax(most, r + 0.6 * way);
     }
     if (w->plan->reach > 0) return w->plan->reach / LARGEST_GROUND;
-    return fmax(1.25 * most, 1.45 * sqrt(sum));
+    return fmax(1.15 * most, 1.34 * sqrt(sum));
 }
 
 /* Nodes of things without a place are taken out of the scene, with their instances. */
@@ -301,6 +301,7 @@ dar_status dar_synth_make(dar_synth *s, const dar_synth_plan *plan, dar_err *e)
     *s = (dar_synth){ 0 };
     DAR_ASSERT(plan->frames >= 1 && plan->fps > 0, "synth: %zu frames, %g a second", plan->frames, plan->fps);
     DAR_TRY(dar_make_open(&w.maker, &s->scene, plan->frames, plan->fps, e));
+    w.maker.bare = plan->bare;
     s->box = room(&w, plan->frames, sizeof *s->box);
     add_things(&w);
     dar_make_close(&w.maker);

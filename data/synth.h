@@ -30,6 +30,7 @@ typedef struct dar_synth_plan {
     int width, height; /* [px] */
     size_t frames;
     double fps;
+    bool bare; /* without textures: geometry alone is wanted */
 } dar_synth_plan;
 
 dar_synth_plan dar_synth_standard(void); /* seeds 0, training set, 224 x 128, 17 frames, 16 a second */
