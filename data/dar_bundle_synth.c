@@ -39,8 +39,8 @@ static const dar_option options[] = {
       .help = "directory of the set; bundles that are there stay" },
     { .name = "set", .placeholder = "NAME", .type = DAR_ARG_CHOICE, .target = &o.set, .standard = "train",
       .names = dar_synth_set_names, .help = "train: any number, all different; 4d_vis: 17 scenes x 4 "
-      "camera paths; ood34: 17 scenes of other kinds x 2; refvar: one scene and path, 10 appearances; motion-separation: 5 animations x 5 "
-      "paths; correspondence: 16 large orbits" },
+      "camera paths; ood34: 17 scenes of other kinds x 2; refvar: one scene and path, 10 appearances; "
+      "motion-separation: 5 animations x 5 paths; correspondence: 16 large orbits" },
     { .name = "count", .placeholder = "N", .type = DAR_ARG_INT, .target = &o.count, .lo = 1, .hi = MOST,
       .help = "number of bundles (default: all of the set; of train 100)" },
     { .name = "family", .placeholder = "NAME", .type = DAR_ARG_TEXT, .target = &o.family,
