@@ -57,6 +57,7 @@ typedef struct dar_lighting {
     size_t bulbs;
     dar_sky sky;
     double sky_light; /* share of the sky's radiance that lights surfaces */
+    double occlusion; /* share of it that is lost on what faces up and lies below something */
     double up[3];     /* unit */
     double softness;  /* width of the edges of shadows, share of the scene's size */
     double exposure;
@@ -79,8 +80,8 @@ dar_lighting dar_lighting_of(size_t kind, bool z_up);
 /* Turn all directions from y up to z up. */
 void dar_lighting_z_up(dar_lighting *l);
 
-/* With y up: move the first sun, and the sky's glow with it.  Azimuth from z towards x, height above the level [rad].
- */
+/* With y up: move the first sun, and the sky's glow with it.  Azimuth from z towards x, height above the level, [rad].
+ * What a lighting with z up needs is done afterwards. */
 void dar_lighting_aim(dar_lighting *l, double azimuth, double height);
 
 /* ---------------------------------------------------------------- prepared */

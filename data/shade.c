@@ -8,6 +8,8 @@
 #include "lib/log.h"
 #include "lib/thread.h"
 
+#define OVERHEAD 64 /* [px] side of the map from above: its edges are an eighth of the scene wide */
+
 const char *const dar_shade_stage_name[] = { "samples", "shadows", "light" };
 
 /* Texels of shadow maps are about as large as pixels when the scene fills the picture. */
@@ -25,21 +27,25 @@ dar_shade_config dar_shade_default(int width, int height)
                                .lighting = dar_lighting_of(0, false) };
 }
 
+static void init_shadow(const dar_shade *s, dar_shadow *shadow, const double toward[3], int side, double width,
+                        dar_arena *a)
+{
+    dar_shadow_config w = { .side = side, .width = width, .blend_cutoff = s->config.raster.blend_cutoff };
+    memcpy(w.toward, toward, sizeof w.toward);
+    memcpy(w.lo, s->config.lo, sizeof w.lo);
+    memcpy(w.hi, s->config.hi, sizeof w.hi);
+    dar_shadow_init(shadow, s->scene, &w, a);
+}
+
 static void init_shadows(dar_shade *s, dar_arena *a)
 {
     const dar_shade_config *c = &s->config;
+    const dar_lighting *l = &c->lighting;
     double size = 0;
     for (int k = 0; k < 3; k++) size = fmax(size, c->hi[k] - c->lo[k]);
-    for (size_t i = 0; i < c->lighting.suns; i++) {
-        dar_shadow_config w = { .side = c->shadow_side,
-                                .width = c->lighting.softness * size,
-                                .blend_cutoff = c->raster.blend_cutoff };
-        if (!c->lighting.sun[i].shadow) continue;
-        memcpy(w.toward, c->lighting.sun[i].toward, sizeof w.toward);
-        memcpy(w.lo, c->lo, sizeof w.lo);
-        memcpy(w.hi, c->hi, sizeof w.hi);
-        dar_shadow_init(&s->shadow[i], s->scene, &w, a);
-    }
+    for (size_t i = 0; i < l->suns; i++)
+        if (l->sun[i].shadow) init_shadow(s, &s->shadow[i], l->sun[i].toward, c->shadow_side, l->softness * size, a);
+    if (l->occlusion > 0) init_shadow(s, &s->overhead, l->up, OVERHEAD, size, a);
 }
 
 void dar_shade_init(dar_shade *s, const dar_scene *scene, const dar_shade_config *c, dar_arena *a)
@@ -104,6 +110,7 @@ void dar_shade_draw(dar_shade *s, const dar_pose *p, const dar_view *v, uint8_t 
     }
     for (size_t i = 0; i < l->suns; i++)
         if (l->sun[i].shadow) dar_shadow_draw(&s->shadow[i], p);
+    if (l->occlusion > 0) dar_shadow_draw(&s->overhead, p);
     s->seconds[DAR_SHADE_SHADOW] += lap(&mark);
     dar_shade_light(s, v, rgb);
     s->seconds[DAR_SHADE_LIGHT] += lap(&mark);

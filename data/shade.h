@@ -11,7 +11,8 @@
  *
  * The picture is drawn with n x n samples per pixel, on a grid, and covers what data/raster.h covers.  Of a pixel's
  * samples those of one triangle are shaded once, at their mean; samples are averaged in linear light.  Surfaces are lit
- * from the side that is seen.
+ * from the side that is seen.  How much of the sky is hidden by what lies overhead, a coarse shadow map from above
+ * tells.
  *
  * Colour: texture times factor times vertex colour, in linear light.  Surface: matte if its gloss and its metallic are
  * 0, else with a highlight (GGX, roughness 1 - gloss) and a mirrored sky; what has no material is white and has
@@ -57,6 +58,7 @@ typedef struct dar_shade {
     dar_gbuffer g; /* instance, triangle, corner: [n H, n W] */
     dar_mip *mip;
     dar_shadow shadow[DAR_LIGHTS_MOST];
+    dar_shadow overhead; /* of the sky, coarse, if it has occlusion */
     dar_srgb *srgb;
     dar_skylight *sky;
     bool drawn;

@@ -80,12 +80,19 @@ static void add_bulbs(const dar_lighting *lighting, const dar_shade_place *p, co
     }
 }
 
+/* Share of the sky's light that arrives. */
+static float open_sky(const dar_shade *s, const dar_shade_place *p)
+{
+    float up = dot(p->normal, s->sky->up), most = up * (float)s->config.lighting.occlusion;
+    return most > 0 ? 1 - most * (1 - dar_shadow_at(&s->overhead, p->x, p->own)) : 1;
+}
+
 static void add_sky(const dar_shade *s, const dar_shade_place *p, const struct lobe *l, float y[3])
 {
-    float light[3], wide[3], sharp[3], mirrored[3], across = dot(p->normal, p->eye);
+    float light[3], wide[3], sharp[3], mirrored[3], across = dot(p->normal, p->eye), open = open_sky(s, p);
 
     dar_skylight_on(s->sky, p->normal, light);
-    for (int c = 0; c < 3; c++) y[c] += light[c] * l->matte[c];
+    for (int c = 0; c < 3; c++) y[c] += open * light[c] * l->matte[c];
     if (!l->shiny) return;
     for (int c = 0; c < 3; c++) mirrored[c] = 2 * across * p->normal[c] - p->eye[c];
     dar_skylight_on(s->sky, mirrored, wide);
@@ -93,7 +100,7 @@ static void add_sky(const dar_shade *s, const dar_shade_place *p, const struct l
     float edge = fifth(1 - fminf(fmaxf(across, 0), 1)), share = l->gloss * l->gloss;
     for (int c = 0; c < 3; c++) {
         float most = fmaxf(l->gloss, l->mirror[c]);
-        y[c] += (wide[c] + share * (sharp[c] - wide[c])) * (l->mirror[c] + (most - l->mirror[c]) * edge);
+        y[c] += open * (wide[c] + share * (sharp[c] - wide[c])) * (l->mirror[c] + (most - l->mirror[c]) * edge);
     }
 }
 

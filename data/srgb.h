@@ -8,7 +8,7 @@
 
 #include <stdint.h>
 
-#define DAR_SRGB_GUESSES 1024
+#define DAR_SRGB_GUESSES 4096
 
 typedef struct dar_srgb {
     float linear[256];               /* of each value */

@@ -141,6 +141,61 @@ static void lambert(void **state)
     }
 }
 
+/* A bulb before a sheet: its distance and the slant differ from pixel to pixel. */
+static void bulb(void **state)
+{
+    enum { SIDE = 16 };
+    dar_shade_config c = one_sun(SIDE, SIDE, 0, 0, 1);
+    dar_view v = front(SIDE, SIDE, 1.5);
+    painting p;
+    dar_scene s;
+    (void)state;
+    made_init(&s);
+    sheet(&s, made_material(&s, false));
+    made_instance(&s, 0, NULL);
+    c.lighting.suns = 0, c.lighting.bulbs = 1;
+    c.lighting.bulb[0] = (dar_bulb){ .at = { 0.3, -0.4, 0.8 }, .color = { 0.5, 0.4, 0.3 }, .reach = 0.9 };
+    c.samples = 1;
+    paint_init(&p, &s, &c);
+    paint(&p, &v);
+    for (int i = 1; i < SIDE - 1; i++) {
+        double x = (i + 0.5 - v.cx) / v.fx * 1.5 - 0.3, y = -(i + 0.5 - v.cy) / v.fy * 1.5 + 0.4;
+        double square = x * x + y * y + 0.64, share = 0.8 / sqrt(square) / (0.1 + 0.9 * square / 0.81);
+        for (int k = 0; k < 3; k++)
+            CHECK_NEAR("bulb", pixel(&p, i, i)[k], display(c.lighting.bulb[0].color[k] * share), ROUNDING);
+    }
+    paint_free(&p);
+}
+
+/* Below a roof an even sky lights a floor by 1 - occlusion; without the roof by all of it. */
+static void occlusion(void **state)
+{
+    static const double floor_at[12] = { 3, 0, 0, 0, 0, 0, 3, 0, 0, -3, 0, 0 };
+    static const double roof_at[12] = { 2, 0, 0, 0, 0, 0, 2, 2, 0, -2, 0, 0 };
+    static const double eye[3] = { 0.1, 1.5, 0.1 }, at[3] = { 0, 0, 0 };
+    (void)state;
+    for (int roof = 0; roof < 2; roof++) {
+        dar_shade_config c = one_sun(8, 8, 0, 1, 0);
+        dar_view v = made_view(8, 8, eye, at);
+        painting p;
+        dar_scene s;
+        made_init(&s);
+        sheet(&s, made_material(&s, true));
+        made_instance(&s, 0, floor_at);
+        if (roof) made_instance(&s, 0, roof_at);
+        c.lighting.suns = 0;
+        c.lighting.occlusion = 0.75;
+        for (int k = 0; k < 3; k++) {
+            c.lo[k] = k == 1 ? 0 : -3, c.hi[k] = k == 1 ? 2 : 3;
+            c.lighting.sky.zenith[k] = c.lighting.sky.horizon[k] = c.lighting.sky.ground[k] = 0.5;
+        }
+        paint_init(&p, &s, &c);
+        paint(&p, &v);
+        CHECK_NEAR("floor", pixel(&p, 4, 4)[0], display(roof ? 0.125 : 0.5), ROUNDING + 0.1);
+        paint_free(&p);
+    }
+}
+
 /* Seen from behind, a sheet is lit from behind. */
 static void two_sides(void **state)
 {
@@ -552,12 +607,12 @@ static void wrong_calls(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(srgb),        cmocka_unit_test(lambert),     cmocka_unit_test(two_sides),
-        cmocka_unit_test(sphere),      cmocka_unit_test(even_sky),    cmocka_unit_test(any_sky),
-        cmocka_unit_test(up),          cmocka_unit_test(background),  cmocka_unit_test(coverage),
-        cmocka_unit_test(texture),     cmocka_unit_test(far_texture), cmocka_unit_test(vertex_colors),
-        cmocka_unit_test(shadow),      cmocka_unit_test(threads),     cmocka_unit_test(still),
-        cmocka_unit_test(wrong_calls),
+        cmocka_unit_test(srgb),        cmocka_unit_test(lambert),       cmocka_unit_test(bulb),
+        cmocka_unit_test(occlusion),   cmocka_unit_test(two_sides),     cmocka_unit_test(sphere),
+        cmocka_unit_test(even_sky),    cmocka_unit_test(any_sky),       cmocka_unit_test(up),
+        cmocka_unit_test(background),  cmocka_unit_test(coverage),      cmocka_unit_test(texture),
+        cmocka_unit_test(far_texture), cmocka_unit_test(vertex_colors), cmocka_unit_test(shadow),
+        cmocka_unit_test(threads),     cmocka_unit_test(still),         cmocka_unit_test(wrong_calls),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
