@@ -315,7 +315,14 @@ static dar_status draw_sheet(const struct job *j, dar_err *e)
     const dar_sheet_plan plan = { title, NULL, (cells + COLUMNS - 1) / COLUMNS, COLUMNS, CELL, (size_t)height };
     DAR_TRY(dar_sheet_init(&sheet, &plan, e));
     dar_status s = DAR_OK;
-    for (size_t i = 0; i < cells && s == DAR_OK; i++) s = draw_one(&sheet, i, i * j->count / cells, e);
+    for (size_t i = 0; i < cells && s == DAR_OK; i++) {
+        size_t index = i * j->count / cells;
+        if (i % COLUMNS == 0) {
+            snprintf(title, sizeof title, "%06zu", index);
+            dar_sheet_row(&sheet, i / COLUMNS, title, NULL);
+        }
+        s = draw_one(&sheet, i, index, e);
+    }
     if (s == DAR_OK) s = dar_sheet_write(&sheet, o.sheet, e);
     dar_sheet_free(&sheet);
     return s;

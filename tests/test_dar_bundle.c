@@ -516,6 +516,47 @@ static void interrupted(void **state)
     CHECK(one_line(ran.err) && strstr(ran.err, "interrupted after "), "%s", ran.err);
 }
 
+#define SYNTH "synth", "--count", "6", "--size", "48x32", "--frames", "5", "--seed", "3"
+
+/* A run that is killed when bundle `index` appears. */
+static void kill_at(const char *threads, const char *bundle)
+{
+    pid_t pid = start((const char *const[]){ SYNTH, "-o", "torn", "--threads", threads, NULL });
+    for (int i = 0; i < 4000 && !is_there(bundle); i++) nanosleep(&(struct timespec){ .tv_nsec = 2500000 }, NULL);
+    kill(pid, SIGKILL);
+    finish(pid);
+    CHECK(is_there(bundle), "%s is not there: %s", bundle, ran.err);
+}
+
+static void synthetic(void **state)
+{
+    struct stat before, after;
+    char a[64], b[64];
+    (void)state;
+    GOOD(SYNTH, "-o", "calm", "--threads", "1", "--sheet", "calm.png");
+    CHECK(is_there("calm.png"), "no sheet");
+    kill_at("2", "torn/000000");
+    assert_int_equal(stat("torn/000000/gbuffer.h5", &before), 0);
+    kill_at("1", "torn/000003");
+    GOOD(SYNTH, "-o", "torn", "--threads", "3", "--json");
+    CHECK(printed(NULL, "made") <= 2, "bundles were made again");
+    assert_int_equal(stat("torn/000000/gbuffer.h5", &after), 0);
+    CHECK(before.st_ino == after.st_ino && before.st_mtim.tv_nsec == after.st_mtim.tv_nsec,
+          "a finished bundle changed");
+    for (int i = 0; i < 6; i++) {
+        snprintf(a, sizeof a, "calm/%06d", i);
+        snprintf(b, sizeof b, "torn/%06d", i);
+        same_bundle(a, b);
+        GOOD("check", b);
+    }
+    same_file("calm/manifest.json", "torn/manifest.json");
+    assert_int_equal(count("torn", ""), 7);
+    assert_int_equal(count("torn", ".making"), 0);
+    assert_int_equal(RUN("synth", "-o", "x", "--set", "4d_vis", "--count", "69"), 2);
+    assert_int_equal(RUN("synth", "-o", "x", "--family", "unicorn"), 2);
+    CHECK(!is_there("x"), "a refused set has a directory");
+}
+
 /* Files may not grow beyond 16 kB: as on a full disk, writing fails half way. */
 static void full_disk(void **state)
 {
@@ -563,6 +604,7 @@ int main(int argc, char **argv)
         cmocka_unit_test(refusals),
         cmocka_unit_test(killed),
         cmocka_unit_test(interrupted),
+        cmocka_unit_test(synthetic),
         cmocka_unit_test(full_disk),
     };
     char own[PATH_MAX];
