@@ -19,8 +19,8 @@ const dar_lighting_kind dar_lighting_kinds[] = {
     { "day", "high sun, blue sky with clouds",
       { .sun = { { { 0.42, 0.72, 0.55 }, { 0.95, 0.88, 0.74 }, true } }, .suns = 1,
         .sky = { .kind = DAR_SKY_CLOUDS, .zenith = { 0.16, 0.33, 0.68 }, .horizon = { 0.62, 0.74, 0.86 },
-                 .ground = { 0.26, 0.24, 0.20 }, .haze = 0.08, .glow = { 0.30, 0.27, 0.20 },
-                 .glow_toward = { 0.42, 0.72, 0.55 }, .glow_size = 0.35, .detail = { 0.95, 0.95, 0.96 }, .seed = 1 },
+                 .ground = { 0.22, 0.22, 0.17 }, .haze = 0.06, .glow = { 0.60, 0.54, 0.40 },
+                 .glow_toward = { 0.42, 0.72, 0.55 }, .glow_size = 0.22, .detail = { 0.95, 0.95, 0.96 }, .seed = 1 },
         .sky_light = 0.8, .occlusion = 0.6, .softness = 0.012, .exposure = 0.85 } },
     { "studio", "key, fill and rim before a grey backdrop",
       { .sun = { { { 0.55, 0.62, 0.56 }, { 0.80, 0.78, 0.75 }, true },
@@ -32,8 +32,8 @@ const dar_lighting_kind dar_lighting_kinds[] = {
     { "sunset", "low warm sun, hills",
       { .sun = { { { -0.72, 0.34, 0.60 }, { 1.15, 0.62, 0.30 }, true } }, .suns = 1,
         .sky = { .kind = DAR_SKY_HILLS, .zenith = { 0.10, 0.14, 0.32 }, .horizon = { 0.78, 0.42, 0.26 },
-                 .ground = { 0.10, 0.08, 0.09 }, .haze = 0.10, .glow = { 0.70, 0.34, 0.10 },
-                 .glow_toward = { -0.90, 0.15, 0.40 }, .glow_size = 0.50, .detail = { 0.11, 0.09, 0.14 }, .seed = 2 },
+                 .ground = { 0.10, 0.08, 0.09 }, .haze = 0.10, .glow = { 1.30, 0.64, 0.20 },
+                 .glow_toward = { -0.90, 0.15, 0.40 }, .glow_size = 0.32, .detail = { 0.11, 0.09, 0.14 }, .seed = 2 },
         .sky_light = 1.0, .occlusion = 0.6, .softness = 0.012, .exposure = 0.95 } },
     { "overcast", "soft light from above, weak shadows",
       { .sun = { { { 0.20, 0.94, 0.28 }, { 0.36, 0.36, 0.36 }, true } }, .suns = 1,
@@ -128,7 +128,7 @@ static void mix(float y[3], const double to[3], float share)
 void dar_skylight_smooth(const dar_skylight *s, const float d[3], float y[3])
 {
     const dar_sky *sky = &s->sky;
-    float h = dot(d, s->up), toward = 0, width = 1 - cosf((float)sky->glow_size);
+    float h = dot(d, s->up), toward = 0, width = (1 - cosf((float)sky->glow_size)) / 0.41421356f;
 
     for (int c = 0; c < 3; c++) {
         y[c] = (float)sky->horizon[c];
@@ -136,8 +136,9 @@ void dar_skylight_smooth(const dar_skylight *s, const float d[3], float y[3])
     }
     float glow = width / (width + fmaxf(1 - toward, 0));
     if (h > 0) mix(y, sky->zenith, 1 - (1 - h) * (1 - h));
-    for (int c = 0; c < 3; c++) y[c] += (float)sky->glow[c] * glow * glow * 2 * (h > 0);
-    if (h < 0) mix(y, sky->ground, ramp(0, (float)sky->haze, -h));
+    for (int c = 0; c < 3; c++) y[c] += (float)sky->glow[c] * glow * glow; /* half at glow_size */
+    if (h < 0)
+        mix(y, sky->ground, ramp(0, (float)sky->haze, -h) * (0.7f + 0.3f * ramp(0, 0.7f, -h))); /* air before it */
 }
 
 /* Blended between four numbers of the table, which repeats. */

@@ -297,6 +297,30 @@ static void any_sky(void **state)
     }
 }
 
+/* The gradient where it is said to be what: at its ends, and the glow at its middle and at its size. */
+static void gradient(void **state)
+{
+    static dar_skylight sky;
+    dar_lighting l = one_sun(1, 1, 0, 0, 1).lighting;
+    float up_there[3] = { 0, 1, 0 }, level[3] = { 1, 0, 0 }, down[3] = { 0, -1, 0 }, y[3];
+    (void)state;
+    l.sky.zenith[0] = 0.2, l.sky.horizon[0] = 0.5, l.sky.ground[0] = 0.1;
+    dar_skylight_init(&sky, &l);
+    dar_skylight_at(&sky, up_there, y);
+    CHECK_NEAR("zenith", y[0], 0.2, 1e-6);
+    dar_skylight_at(&sky, level, y);
+    CHECK_NEAR("horizon", y[0], 0.5, 1e-6);
+    dar_skylight_at(&sky, down, y);
+    CHECK_NEAR("ground", y[0], 0.1, 1e-6);
+    l.sky.glow[1] = 0.8, l.sky.glow_size = 0.3;
+    dar_skylight_init(&sky, &l);
+    dar_skylight_at(&sky, up_there, y);
+    CHECK_NEAR("glow", y[1], 0.8, 1e-6);
+    float beside[3] = { sinf(0.3f), cosf(0.3f), 0 };
+    dar_skylight_at(&sky, beside, y);
+    CHECK_NEAR("half of the glow", y[1], 0.4, 1e-5);
+}
+
 /* Lightings with z up are those with y up, turned. */
 static void up(void **state)
 {
@@ -607,12 +631,13 @@ static void wrong_calls(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(srgb),        cmocka_unit_test(lambert),       cmocka_unit_test(bulb),
-        cmocka_unit_test(occlusion),   cmocka_unit_test(two_sides),     cmocka_unit_test(sphere),
-        cmocka_unit_test(even_sky),    cmocka_unit_test(any_sky),       cmocka_unit_test(up),
-        cmocka_unit_test(background),  cmocka_unit_test(coverage),      cmocka_unit_test(texture),
-        cmocka_unit_test(far_texture), cmocka_unit_test(vertex_colors), cmocka_unit_test(shadow),
-        cmocka_unit_test(threads),     cmocka_unit_test(still),         cmocka_unit_test(wrong_calls),
+        cmocka_unit_test(srgb),        cmocka_unit_test(lambert),     cmocka_unit_test(bulb),
+        cmocka_unit_test(occlusion),   cmocka_unit_test(two_sides),   cmocka_unit_test(sphere),
+        cmocka_unit_test(even_sky),    cmocka_unit_test(any_sky),     cmocka_unit_test(gradient),
+        cmocka_unit_test(up),          cmocka_unit_test(background),  cmocka_unit_test(coverage),
+        cmocka_unit_test(texture),     cmocka_unit_test(far_texture), cmocka_unit_test(vertex_colors),
+        cmocka_unit_test(shadow),      cmocka_unit_test(threads),     cmocka_unit_test(still),
+        cmocka_unit_test(wrong_calls),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
