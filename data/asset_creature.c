@@ -18,6 +18,8 @@ typedef struct creature {
     unsigned coat;             /* patterns; 0: any */
 } creature;
 
+#define FASTEST 1.3 /* [m/s] */
+
 /* The skeleton as it grows. */
 struct body {
     dar_maker *m;
@@ -200,6 +202,12 @@ static void add_trunk(struct body *b, int *hip, int *chest, int *head)
     swing(b, *head, Y, 0, 0.12, 0.4);
 }
 
+/* [m/s] at which feet do not slip. */
+static double speed_of(const creature *k)
+{
+    return (k->splay > 0.2 ? 1.4 : 3.2) * k->leg * sin(k->step) * k->tempo;
+}
+
 static creature vary(const creature *row, dar_dice *d)
 {
     creature k = *row;
@@ -208,6 +216,7 @@ static creature vary(const creature *row, dar_dice *d)
     for (size_t i = 0; i < DAR_COUNT(part); i++) *part[i] = dar_dice_near(d, *part[i], 0.14);
     k.pitch += dar_dice_in(d, -5, 5);
     k.nod += dar_dice_in(d, -8, 8);
+    if (!(k.height > 0)) k.tempo *= fmin(1, FASTEST / speed_of(&k));
     return k;
 }
 
@@ -242,7 +251,7 @@ static void make_creature(dar_maker *m, dar_dice *d, const void *row, dar_asset 
     dar_make_skin(m, out->root, dar_make_end(m, "creature"), b.joint, b.joints);
     out->way = k.height > 0 ? DAR_ASSET_FLIES : DAR_ASSET_WALKS;
     out->height = k.height > 0 ? dar_dice_near(d, k.height, 0.3) : 0;
-    out->speed = k.height > 0 ? 1.2 : (k.splay > 0.2 ? 1.4 : 3.2) * k.leg * sin(k.step) * k.tempo;
+    out->speed = k.height > 0 ? 1.2 : speed_of(&k);
 }
 
 /* ---------------------------------------------------------------- kinds */

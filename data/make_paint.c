@@ -194,6 +194,7 @@ int dar_make_paint(dar_maker *m, const dar_paint_style *style)
     dar_material material = {
         .name = "paint", .color = { 1, 1, 1, 1 }, .image = DAR_NONE, .double_sided = style->double_sided
     };
+    material.gloss = dar_dice_chance(d, 0.4) ? dar_dice_in(d, 0.2, 0.65) : 0;
     if (m->bare) return add_material(m, material);
     p.n = 1 + (int)dar_dice_below(d, 3);
     p.k = 1 + (int)dar_dice_below(d, 3);
@@ -215,6 +216,8 @@ static double linear(double x)
 
 int dar_make_plain(dar_maker *m, double r, double g, double b)
 {
-    return add_material(
-        m, (dar_material){ .name = "plain", .color = { linear(r), linear(g), linear(b), 1 }, .image = DAR_NONE });
+    return add_material(m, (dar_material){ .name = "plain",
+                                           .color = { linear(r), linear(g), linear(b), 1 },
+                                           .image = DAR_NONE,
+                                           .gloss = DAR_GLOSS_UNKNOWN });
 }

@@ -84,32 +84,41 @@ static void stand(const dar_place_area *area, dar_place_thing *x)
     }
 }
 
-/* A walk: keys on the way of a random walker, Catmull and Rom's spline between them, facing where it goes. */
+#define STRIDE 0.4 /* [m] between keys, about */
+
+/* A walk: keys on the way of a random walker who turns back in the outer half, Catmull and Rom's spline between them,
+ * facing where it goes. */
 static void draw_walk(const dar_place_area *area, dar_place_thing *x, dar_dice *d)
 {
-    enum { KEYS = 6 };
-    dar_camera_key key[KEYS];
+    enum { LEAST = 6, MOST = 32 };
+    dar_camera_key key[MOST];
     double last = (double)(area->frames > 1 ? area->frames - 1 : 1), length = x->asset->speed * last / area->fps;
     double heading = dar_dice_in(d, -M_PI, M_PI), r = area->radius * sqrt(dar_dice_in(d, 0, 1)),
            a = dar_dice_in(d, -M_PI, M_PI);
-    double at[2] = { r * sin(a), r * cos(a) }, bend = dar_dice_in(d, -0.7, 0.7);
-    for (int k = 0; k < KEYS; k++) {
-        key[k] = (dar_camera_key){ .time = last * k / (KEYS - 1) };
+    double at[2] = { r * sin(a), r * cos(a) }, bend = dar_dice_in(d, -0.9, 0.9);
+    size_t keys = (size_t)fmin(fmax(length / STRIDE + 1, LEAST), MOST);
+    double step = length / (double)(keys - 1);
+    for (size_t k = 0; k < keys; k++) {
+        key[k] = (dar_camera_key){ .time = last * (double)k / (double)(keys - 1) };
         memcpy(key[k].view.c2w, dar_affine_identity, sizeof key[k].view.c2w);
         key[k].view.c2w[3] = at[0];
         key[k].view.c2w[11] = at[1];
-        at[0] += length / (KEYS - 1) * sin(heading);
-        at[1] += length / (KEYS - 1) * cos(heading);
-        heading += bend * fmin(1, 0.4 + length / 4) + dar_dice_in(d, -0.25, 0.25);
+        at[0] += step * sin(heading);
+        at[1] += step * cos(heading);
+        heading += step * (bend + dar_dice_in(d, -0.8, 0.8));
+        if (hypot(at[0], at[1]) > 0.5 * area->radius) {
+            double back = remainder(atan2(-at[0], -at[1]) - heading, 2 * M_PI);
+            heading += copysign(fmin(fabs(back), 2.2 * step), back);
+        }
     }
     for (size_t t = 0; t < area->frames; t++) {
         const dar_camera_style style = { DAR_TURN_SLERP, DAR_MOVE_CATMULL_ROM };
         dar_view now, next;
         double s = (double)t, ahead = fmin(s, last - 0.5) + 0.5;
-        dar_camera_between(key, KEYS, style, s, &now);
-        dar_camera_between(key, KEYS, style, ahead - 0.5, &next);
+        dar_camera_between(key, keys, style, s, &now);
+        dar_camera_between(key, keys, style, ahead - 0.5, &next);
         double from[2] = { next.c2w[3], next.c2w[11] };
-        dar_camera_between(key, KEYS, style, ahead, &next);
+        dar_camera_between(key, keys, style, ahead, &next);
         turn_about(1, atan2(next.c2w[3] - from[0], next.c2w[11] - from[1]), x->turn[t]);
         x->at[t][0] = now.c2w[3], x->at[t][1] = 0, x->at[t][2] = now.c2w[11];
     }

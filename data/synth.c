@@ -6,10 +6,11 @@
 
 #include "data/affine.h"
 
-#define MARGIN 0.08 /* [m] between two things */
-#define TRIES  96   /* places, or ways, of one thing */
-#define PATHS  24   /* camera paths */
-#define STILLS 9    /* things beside the animated ones, at most */
+#define MARGIN  0.08 /* [m] between two things */
+#define TRIES   96   /* places, or ways, of one thing */
+#define PATHS   24   /* camera paths */
+#define LONGEST 2    /* [m] of a way that the area makes room for */
+#define STILLS  9    /* things beside the animated ones, at most */
 
 #define GROUND_DEPTH   0.3  /* [m] */
 #define LARGEST_GROUND 1.43 /* half its longest side, in radii of the area */
@@ -69,11 +70,12 @@ static void add_things(struct work *w)
 {
     dar_dice *d = &w->dice;
     const dar_asset_kind *subject = w->plan->subject ? w->plan->subject : draw_kind(w->plan->set, true, d);
-    bool alone = strcmp(subject->family, "interior") == 0;
+    bool indoors = strcmp(subject->family, "interior") == 0;
     size_t others = dar_dice_below(d, 3), stills = 1 + dar_dice_below(d, STILLS - 2), n = 0;
+    if (w->plan->alone) others = 0, stills = stills / 2;
     add_thing(w, subject, n++);
-    for (size_t i = 0; i < others && !alone; i++) add_thing(w, draw_kind(w->plan->set, false, d), n++);
-    for (size_t i = 0; i < stills && !alone; i++)
+    for (size_t i = 0; i < others && !indoors; i++) add_thing(w, draw_kind(w->plan->set, false, d), n++);
+    for (size_t i = 0; i < stills && !indoors; i++)
         add_thing(w, dar_asset_still_at(dar_dice_below(d, dar_asset_stills())), n++);
 }
 
@@ -134,7 +136,7 @@ static double area_radius(const struct work *w)
     double sum = 0, most = 0, seconds = (double)(w->plan->frames - 1) / w->plan->fps;
     for (size_t i = 0; i < o->things; i++) {
         double r = reach_of(o->thing[i].box, w->plan->frames);
-        double way = o->thing[i].asset.way == DAR_ASSET_STAYS ? 0 : o->thing[i].asset.speed * seconds;
+        double way = o->thing[i].asset.way == DAR_ASSET_STAYS ? 0 : fmin(o->thing[i].asset.speed * seconds, LONGEST);
         sum += r * (r + way);
         most = fmax(most, r + 0.6 * way);
     }

@@ -50,6 +50,7 @@ static void plan_vis(uint64_t seed, size_t row, size_t column, dar_synth_plan *p
     p->seed = p->look = p->view = seed_of(seed, "4d_vis", row);
     p->set = DAR_ASSET_VIS;
     p->subject = kind_of(DAR_ASSET_VIS, row);
+    p->alone = row % 2 == 0;
     p->path = path_named(benchmark[column]);
 }
 
@@ -78,6 +79,7 @@ static void plan_refvar(uint64_t seed, size_t row, size_t column, dar_synth_plan
     p->look = seed_of(seed, "refvar look", row);
     p->set = DAR_ASSET_VIS;
     p->subject = kind_named("racer");
+    p->alone = true;
     p->path = path_named("orbit-30");
 }
 
@@ -90,7 +92,8 @@ static void plan_separation(uint64_t seed, size_t row, size_t column, dar_synth_
     p->set = DAR_ASSET_VIS;
     p->subject = kind_named(subject[row]);
     p->path = path_named(path[column]);
-    p->reach = 4;
+    p->alone = true;
+    p->reach = 3;
 }
 
 static void plan_correspondence(uint64_t seed, size_t row, size_t column, dar_synth_plan *p)
@@ -129,6 +132,7 @@ void dar_synth_set_plan(const dar_synth_set *set, uint64_t seed, size_t index, s
     p->set = DAR_ASSET_TRAIN;
     p->subject = NULL, p->path = NULL;
     p->reach = 0;
+    p->alone = false;
     set->plan(seed, index / columns, index % columns, p);
     if (!family || p->subject) return;
     dar_dice d = dar_dice_for(p->seed, "subject", 0);
