@@ -14,7 +14,9 @@ extern const size_t dar_asset_creature_count, dar_asset_vehicle_count, dar_asset
 #define DAR_PAINT(name) (1u << DAR_PATTERN_##name)
 static inline int dar_asset_paint(dar_maker *m, unsigned patterns)
 {
-    return dar_make_paint(m, &(dar_paint_style){ .patterns = patterns, .palette = DAR_NONE, .contrast = 1 });
+    dar_paint_style style = dar_make_any;
+    style.patterns = patterns;
+    return dar_make_paint(m, &style);
 }
 
 #endif

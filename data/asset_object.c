@@ -107,7 +107,7 @@ static void chair(dar_maker *m, dar_dice *d)
     shift(m, 0, h + 0.34, -0.46 * s), dar_make_box(m, s, 0.4, 0.05);
     for (int i = 0; i < 4; i++) {
         shift(m, (i & 1 ? 0.44 : -0.44) * s, h / 2, (i & 2 ? 0.44 : -0.44) * s);
-        dar_make_box(m, 0.05, i & 2 ? h : h, 0.05);
+        dar_make_box(m, 0.05, h, 0.05);
     }
 }
 
@@ -165,7 +165,7 @@ static void branch(dar_maker *m, dar_dice *d, const double from[3], const double
         m->paint = leaf;
         dar_make_shift(m, to[0], to[1], to[2]);
         dar_make_round(m, r, 0.8 * r, r, 1, 1);
-        m->paint = (int)wood;
+        m->paint = wood;
         return;
     }
     double length = sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2]), a = dar_dice_in(d, 0, 6);
@@ -249,7 +249,6 @@ static void house(dar_maker *m, dar_dice *d)
     m->paint = dar_asset_paint(m, DAR_PAINT(BRICKS) | DAR_PAINT(TILES) | DAR_PAINT(STRIPES) | DAR_PAINT(ZIGZAG));
     shift(m, 0, h, 0);
     dar_make_rotate(m, 0, 1, 0, M_PI / 4);
-    dar_make_stretch(m, 1, 1, 1);
     dar_make_round(m, 0.1 + 0.75 * x, 0.45, 0.1 + 0.75 * x, 2, 2);
     m->paint = dar_make_plain(m, 0.25, 0.18, 0.12);
     shift(m, 0, 0.17, z / 2), dar_make_box(m, 0.18, 0.34, 0.03);

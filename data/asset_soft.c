@@ -41,7 +41,8 @@ static void travel(dar_maker *m, int node, size_t target, double frequency)
 
 static int cloth_paint(dar_maker *m)
 {
-    const dar_paint_style style = { .palette = DAR_NONE, .contrast = 1, .double_sided = true };
+    dar_paint_style style = dar_make_any;
+    style.double_sided = true;
     return dar_make_paint(m, &style);
 }
 

@@ -32,7 +32,7 @@ struct paint {
     dar_pattern pattern;
     double color[4][3]; /* sRGB in [0, 1] */
     int n, k;           /* repeats across; of stripes against their slant */
-    double share, grain, soft;
+    double share, grain;
     float noise[TABLE];
     uint8_t *rgba;
 };
