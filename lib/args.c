@@ -16,7 +16,7 @@
 #define COMMON 6
 
 /* The block that all programs share, with its targets in c. */
-static void common_options(dar_common *c, dar_option out[COMMON])
+static void common_options(const char *seed, dar_common *c, dar_option out[COMMON])
 {
     const dar_option block[COMMON] = {
         { .name = "threads",
@@ -30,7 +30,7 @@ static void common_options(dar_common *c, dar_option out[COMMON])
           .placeholder = "N",
           .type = DAR_ARG_SEED,
           .target = &c->seed,
-          .standard = "0",
+          .standard = seed ? seed : "0",
           .help = "seed of all random numbers" },
         { .name = "dry-run",
           .type = DAR_ARG_FLAG,
@@ -214,7 +214,7 @@ dar_status dar_args_parse(dar_program *p, int argc, char **argv, dar_err *e)
 
     if (p->common) {
         *p->common = (dar_common){ 0 };
-        common_options(p->common, s.common);
+        common_options(p->standard_seed, p->common, s.common);
         s.n += COMMON;
     }
     p->rest = argv + 1;
@@ -337,7 +337,7 @@ void dar_args_help(const dar_program *p, FILE *to)
     if (p->n_options && p->options[0].name) fprintf(to, "\nOptions:\n");
     for (size_t i = 0; i < p->n_options; i++) help_option(to, &p->options[i]);
     fprintf(to, "\n%s:\n", p->commands ? "Options" : "Options of every program");
-    if (p->common) common_options(&unused, common);
+    if (p->common) common_options(p->standard_seed, &unused, common);
     for (size_t i = 0; p->common && i < COMMON; i++) help_option(to, &common[i]);
     for (size_t i = 0; i < DAR_COUNT(last); i++) help_option(to, &last[i]);
 }

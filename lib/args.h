@@ -71,7 +71,8 @@ typedef struct dar_program {
     const char *summary; /* what it does, one sentence */
     const dar_option *options;
     size_t n_options;
-    dar_common *common; /* NULL: takes none of them */
+    dar_common *common;        /* NULL: takes none of them */
+    const char *standard_seed; /* default of --seed; NULL: 0 */
     dar_run_fn *run;
 
     /* Instead of run: what the first argument chooses from, by the last word of their names; ends with NULL. */

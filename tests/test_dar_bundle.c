@@ -3,22 +3,14 @@
 #include "tests/glb.h"
 
 #include <dirent.h>
-#include <fcntl.h>
-#include <ftw.h>
 #include <signal.h>
-#include <spawn.h>
 #include <sys/resource.h>
-#include <sys/stat.h>
-#include <sys/wait.h>
 #include <time.h>
-#include <unistd.h>
 
 #include "data/bundle.h"
 #include "data/png.h"
-#include "lib/file.h"
 #include "lib/json.h"
-
-extern char **environ;
+#include "tests/run.h"
 
 #define W      48
 #define H      32
@@ -29,75 +21,9 @@ static char dir[] = "/tmp/dar-program-XXXXXX", program[PATH_MAX];
 
 /* ---------------------------------------------------------------- running it */
 
-struct ran {
-    int status; /* or 128 + signal */
-    char out[1 << 16], err[1 << 14];
-};
-
-static struct ran ran;
-
-static void read_text(const char *path, char *text, size_t size)
-{
-    FILE *f = fopen(path, "rb");
-    assert_non_null(f);
-    text[fread(text, 1, size - 1, f)] = 0;
-    fclose(f);
-}
-
-/* In the directory of the test; words end with NULL. */
-static pid_t start(const char *const *words)
-{
-    char *argv[32] = { program };
-    posix_spawn_file_actions_t a;
-    pid_t pid;
-    for (int i = 0; words[i]; i++) {
-        assert_true(i < 30);
-        argv[i + 1] = (char *)(uintptr_t)words[i];
-    }
-    posix_spawn_file_actions_init(&a);
-    posix_spawn_file_actions_addopen(&a, 1, "out", O_WRONLY | O_CREAT | O_TRUNC, 0666);
-    posix_spawn_file_actions_addopen(&a, 2, "err", O_WRONLY | O_CREAT | O_TRUNC, 0666);
-    assert_int_equal(posix_spawn(&pid, program, &a, NULL, argv, environ), 0);
-    posix_spawn_file_actions_destroy(&a);
-    return pid;
-}
-
-static int finish(pid_t pid)
-{
-    int how;
-    assert_int_equal(waitpid(pid, &how, 0), pid);
-    read_text("out", ran.out, sizeof ran.out);
-    read_text("err", ran.err, sizeof ran.err);
-    return ran.status = WIFSIGNALED(how) ? 128 + WTERMSIG(how) : WEXITSTATUS(how);
-}
-
-#define RUN(...) finish(start((const char *const[]){ __VA_ARGS__, NULL }))
-
-#define GOOD(...)                                                                                                      \
-    do {                                                                                                               \
-        int good_status = RUN(__VA_ARGS__);                                                                            \
-        CHECK(good_status == 0, "status %d: %s", good_status, ran.err);                                                \
-    } while (0)
-
-static bool one_line(const char *text)
-{
-    const char *end = strchr(text, '\n');
-    return end && !end[1] && end > text;
-}
+#define RUN(...) RUN_PROGRAM(program, __VA_ARGS__)
 
 /* ---------------------------------------------------------------- files */
-
-static int remove_entry(const char *path, const struct stat *st, int type, struct FTW *at)
-{
-    (void)st, (void)type, (void)at;
-    return remove(path);
-}
-
-static bool is_there(const char *path)
-{
-    struct stat st;
-    return lstat(path, &st) == 0;
-}
 
 /* Entries whose names begin with `start`; of a directory. */
 static int count(const char *path, const char *begin)
@@ -112,25 +38,6 @@ static int count(const char *path, const char *begin)
     return n;
 }
 
-static void write_file(const char *path, const void *data, size_t size)
-{
-    FILE *f = fopen(path, "wb");
-    assert_non_null(f);
-    assert_int_equal(fwrite(data, 1, size, f), size);
-    assert_int_equal(fclose(f), 0);
-}
-
-static void same_file(const char *a, const char *b)
-{
-    dar_file_map x, y;
-    dar_err e;
-    CHECK(dar_file_map_open(&x, a, &e) == DAR_OK, "%s", e.text);
-    CHECK(dar_file_map_open(&y, b, &e) == DAR_OK, "%s", e.text);
-    CHECK(x.size == y.size && memcmp(x.data, y.data, x.size) == 0, "%s and %s differ", a, b);
-    dar_file_map_close(&x);
-    dar_file_map_close(&y);
-}
-
 static void same_bundle(const char *a, const char *b)
 {
     DIR *d = opendir(a);
@@ -141,7 +48,7 @@ static void same_bundle(const char *a, const char *b)
         if (f->d_name[0] == '.') continue;
         snprintf(x, sizeof x, "%s/%s", a, f->d_name);
         snprintf(y, sizeof y, "%s/%s", b, f->d_name);
-        same_file(x, y);
+        run_same_file(x, y);
     }
     closedir(d);
 }
@@ -186,7 +93,7 @@ static void write_scene(const char *path, bool broken)
              "\"rotation\"}}],\"samplers\":[{\"input\":%d,\"output\":%d}]}]",
              t, q);
     glb_finish(&g);
-    write_file(path, g.out, g.size);
+    run_write(path, g.out, g.size);
 }
 
 #define SCENE "scene.glb", "--size", "48x32", "--frames", "5", "--fps", "4"
@@ -260,14 +167,14 @@ static void checked(void **state)
 
     /* Another file than the one that was written: the check says no; a bundle that is none is bad input. */
     GOOD("render", SCENE, "-o", "odd");
-    write_file("odd/cameras.txt", "nonsense\n", 9);
+    run_write("odd/cameras.txt", "nonsense\n", 9);
     assert_int_equal(RUN("check", "sound", "odd"), 1);
     assert_non_null(strstr(ran.out, "sound: good"));
     assert_non_null(strstr(ran.out, "odd: bad"));
     assert_non_null(strstr(ran.out, "files: bad"));
     assert_int_equal(RUN("check", "nowhere", "sound"), 2);
     assert_non_null(strstr(ran.out, "sound: good"));
-    write_file("odd/meta.json", "{", 1);
+    run_write("odd/meta.json", "{", 1);
     assert_int_equal(RUN("check", "odd"), 2);
 }
 
@@ -468,12 +375,12 @@ static void refusals(void **state)
     };
     write_scene("nan.glb", true);
     write_scene("scene.glb", false);
-    write_file("short.glb", g.out, g.size / 2);
-    write_file("junk.glb", "glTF what is this", 17);
+    run_write("short.glb", g.out, g.size / 2);
+    run_write("junk.glb", "glTF what is this", 17);
     for (size_t i = 0; i < DAR_COUNT(bad); i++) {
-        int status = finish(start(bad[i].words));
+        int status = run_finish(run_start(program, bad[i].words));
         CHECK(status == 2, "%s %s: status %d: %s", bad[i].words[0], bad[i].says, status, ran.err);
-        CHECK(one_line(ran.err) && !*ran.out, "%s: more or less than a line: %s%s", bad[i].says, ran.err, ran.out);
+        CHECK(run_one_line(ran.err) && !*ran.out, "%s: more or less than a line: %s%s", bad[i].says, ran.err, ran.out);
         CHECK(strstr(ran.err, bad[i].says), "found:    %sexpected: %s", ran.err, bad[i].says);
         CHECK(count(".", "no") == 0, "%s: something is left", bad[i].says);
     }
@@ -486,11 +393,11 @@ static void refusals(void **state)
 /* Start a render that would take a minute, and wait until it writes frames. */
 static pid_t start_long(void)
 {
-    pid_t pid = start((const char *const[]){ "render", "scene.glb", "--size", "320x200", "--frames", "20001", "-o",
-                                             "long", "--trajectory", "full-orbit", NULL });
+    pid_t pid = run_start(program, (const char *const[]){ "render", "scene.glb", "--size", "320x200", "--frames",
+                                                          "20001", "-o", "long", "--trajectory", "full-orbit", NULL });
     for (int i = 0; i < 2000 && count(".", "long") == 0; i++) nanosleep(&(struct timespec){ .tv_nsec = 5000000 }, NULL);
     nanosleep(&(struct timespec){ .tv_nsec = 100000000 }, NULL);
-    CHECK(waitpid(pid, NULL, WNOHANG) == 0 && count(".", "long.tmp") == 1 && !is_there("long"), "it does not run");
+    CHECK(waitpid(pid, NULL, WNOHANG) == 0 && count(".", "long.tmp") == 1 && !run_is_there("long"), "it does not run");
     return pid;
 }
 
@@ -499,21 +406,21 @@ static void killed(void **state)
     (void)state;
     pid_t pid = start_long();
     kill(pid, SIGKILL);
-    assert_int_equal(finish(pid), 128 + SIGKILL);
-    CHECK(!is_there("long") && count(".", "long") == 1, "a bundle, or nothing, is left");
+    assert_int_equal(run_finish(pid), 128 + SIGKILL);
+    CHECK(!run_is_there("long") && count(".", "long") == 1, "a bundle, or nothing, is left");
     GOOD("render", SCENE, "-o", "long");
-    CHECK(is_there("long/meta.json") && count(".", "long") == 1, "leftovers");
+    CHECK(run_is_there("long/meta.json") && count(".", "long") == 1, "leftovers");
 }
 
 static void interrupted(void **state)
 {
     (void)state;
-    nftw("long", remove_entry, 8, FTW_DEPTH | FTW_PHYS);
+    run_remove("long");
     pid_t pid = start_long();
     kill(pid, SIGINT);
-    assert_int_equal(finish(pid), 130);
+    assert_int_equal(run_finish(pid), 130);
     CHECK(count(".", "long") == 0, "something is left");
-    CHECK(one_line(ran.err) && strstr(ran.err, "interrupted after "), "%s", ran.err);
+    CHECK(run_one_line(ran.err) && strstr(ran.err, "interrupted after "), "%s", ran.err);
 }
 
 #define SYNTH "synth", "--count", "6", "--size", "48x32", "--frames", "5", "--seed", "3"
@@ -521,11 +428,11 @@ static void interrupted(void **state)
 /* A run that is killed when bundle `index` appears. */
 static void kill_at(const char *threads, const char *bundle)
 {
-    pid_t pid = start((const char *const[]){ SYNTH, "-o", "torn", "--threads", threads, NULL });
-    for (int i = 0; i < 4000 && !is_there(bundle); i++) nanosleep(&(struct timespec){ .tv_nsec = 2500000 }, NULL);
+    pid_t pid = run_start(program, (const char *const[]){ SYNTH, "-o", "torn", "--threads", threads, NULL });
+    for (int i = 0; i < 4000 && !run_is_there(bundle); i++) nanosleep(&(struct timespec){ .tv_nsec = 2500000 }, NULL);
     kill(pid, SIGKILL);
-    finish(pid);
-    CHECK(is_there(bundle), "%s is not there: %s", bundle, ran.err);
+    run_finish(pid);
+    CHECK(run_is_there(bundle), "%s is not there: %s", bundle, ran.err);
 }
 
 static void synthetic(void **state)
@@ -534,7 +441,7 @@ static void synthetic(void **state)
     char a[64], b[64];
     (void)state;
     GOOD(SYNTH, "-o", "calm", "--threads", "1", "--sheet", "calm.png");
-    CHECK(is_there("calm.png"), "no sheet");
+    CHECK(run_is_there("calm.png"), "no sheet");
     kill_at("2", "torn/000000");
     assert_int_equal(stat("torn/000000/gbuffer.h5", &before), 0);
     kill_at("1", "torn/000003");
@@ -549,12 +456,12 @@ static void synthetic(void **state)
         same_bundle(a, b);
         GOOD("check", b);
     }
-    same_file("calm/manifest.json", "torn/manifest.json");
+    run_same_file("calm/manifest.json", "torn/manifest.json");
     assert_int_equal(count("torn", ""), 7);
     assert_int_equal(count("torn", ".making"), 0);
     assert_int_equal(RUN("synth", "-o", "x", "--set", "4d_vis", "--count", "69"), 2);
     assert_int_equal(RUN("synth", "-o", "x", "--family", "unicorn"), 2);
-    CHECK(!is_there("x"), "a refused set has a directory");
+    CHECK(!run_is_there("x"), "a refused set has a directory");
 }
 
 /* Files may not grow beyond 16 kB: as on a full disk, writing fails half way. */
@@ -567,11 +474,11 @@ static void full_disk(void **state)
     small.rlim_cur = 1 << 14;
     void (*handler)(int) = signal(SIGXFSZ, SIG_IGN); /* the child inherits both */
     assert_int_equal(setrlimit(RLIMIT_FSIZE, &small), 0);
-    pid_t pid = start((const char *const[]){ "render", "scene.glb", "-o", "full", NULL });
+    pid_t pid = run_start(program, (const char *const[]){ "render", "scene.glb", "-o", "full", NULL });
     assert_int_equal(setrlimit(RLIMIT_FSIZE, &old), 0);
     signal(SIGXFSZ, handler);
-    CHECK(finish(pid) == 3, "status %d: %s", ran.status, ran.err);
-    CHECK(one_line(ran.err) && strstr(ran.err, "File too large"), "%s", ran.err);
+    CHECK(run_finish(pid) == 3, "status %d: %s", ran.status, ran.err);
+    CHECK(run_one_line(ran.err) && strstr(ran.err, "File too large"), "%s", ran.err);
     CHECK(count(".", "full") == 0, "something is left");
 }
 
@@ -588,7 +495,7 @@ static int in_directory(void **state)
 static int remove_directory(void **state)
 {
     (void)state;
-    return chdir("/") != 0 || nftw(dir, remove_entry, 8, FTW_DEPTH | FTW_PHYS) != 0;
+    return chdir("/") != 0 || run_remove(dir) != 0;
 }
 
 int main(int argc, char **argv)
@@ -607,9 +514,6 @@ int main(int argc, char **argv)
         cmocka_unit_test(synthetic),
         cmocka_unit_test(full_disk),
     };
-    char own[PATH_MAX];
-    if (argc < 1 || !realpath(argv[0], own)) return 2;
-    *strrchr(own, '/') = 0;
-    if (snprintf(program, sizeof program, "%s/dar-bundle", own) >= (int)sizeof program) return 2;
+    if (argc < 1 || !run_find(program, argv[0], "dar-bundle")) return 2;
     return cmocka_run_group_tests(tests, in_directory, remove_directory) != 0;
 }

@@ -1,0 +1,232 @@
+/* model.c: see model.h. */
+#include "infer/model.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include "data/rays.h"
+#include "models/load.h"
+#include "models/lora.h"
+
+const char *const dar_model_part_name[] = { "dit", "vae", "lora", NULL };
+
+/* ---------------------------------------------------------------- files */
+
+static bool is_there(const char *path)
+{
+    return access(path, F_OK) == 0;
+}
+
+static bool is_directory(const char *path)
+{
+    struct stat st;
+    return stat(path, &st) == 0 && S_ISDIR(st.st_mode);
+}
+
+static void join(char path[PATH_MAX], const char *directory, const char *name)
+{
+    if ((size_t)snprintf(path, PATH_MAX, "%s/%s", directory, name) >= PATH_MAX) *path = 0;
+}
+
+/* The directory that a file lies in, in place. */
+static void directory_of(char *path)
+{
+    char *slash = strrchr(path, '/');
+    snprintf(slash ? slash : path, 2, "%s", slash ? "" : ".");
+}
+
+/* Presets are sought from where the program is run, then beside where it was built. */
+static dar_status find_file(dar_model *m, const char *model, dar_err *e)
+{
+    size_t n = strlen(model);
+    char name[PATH_MAX], program[PATH_MAX];
+    snprintf(m->file, sizeof m->file, "%s", model);
+    if (is_directory(model)) {
+        join(m->file, model, "model.json");
+        if (is_there(m->file)) return DAR_OK;
+        return dar_fail(e, DAR_ERR_USAGE, "%s: found no model.json, expected one that says what the weights are",
+                        model);
+    }
+    if (n > 5 && strcmp(model + n - 5, ".json") == 0) return DAR_OK;
+    snprintf(name, sizeof name, "models/presets/%.200s.json", model);
+    snprintf(m->file, sizeof m->file, "%s", name);
+    if (is_there(m->file)) return DAR_OK;
+    ssize_t k = readlink("/proc/self/exe", program, sizeof program - 1);
+    if (k > 0) {
+        program[k] = 0;
+        for (int i = 0; i < 3; i++) directory_of(program);
+        join(m->file, program, name);
+        if (is_there(m->file)) return DAR_OK;
+    }
+    return dar_fail(e, DAR_ERR_USAGE,
+                    "--model: found '%s', expected a directory with a model.json, a .json file or the "
+                    "name of a preset",
+                    model);
+}
+
+static void find_part(dar_model *m, const dar_model_options *o, dar_model_part part)
+{
+    static const char *const names[DAR_MODEL_PARTS][5] = {
+        { "dit.safetensors", "dit.safetensors.index.json", "diffusion_pytorch_model.safetensors",
+          "diffusion_pytorch_model.safetensors.index.json" },
+        { "vae.safetensors", "vae.pth", "Wan2.2_VAE.pth" },
+        { "lora.safetensors" },
+    };
+    char directory[PATH_MAX], *path = m->path[part];
+    if (o->part[part]) {
+        snprintf(path, PATH_MAX, "%s", o->part[part]);
+        return;
+    }
+    snprintf(directory, sizeof directory, "%s", o->weights ? o->weights : m->file);
+    if (!o->weights) directory_of(directory);
+    for (int i = 0; names[part][i]; i++) {
+        join(path, directory, names[part][i]);
+        if (is_there(path)) return;
+    }
+    *path = 0;
+}
+
+static dar_status open_parts(dar_model *m, const dar_model_options *o, dar_err *e)
+{
+    for (int i = 0; i < DAR_MODEL_PARTS; i++) {
+        find_part(m, o, (dar_model_part)i);
+        if (*m->path[i]) DAR_TRY(dar_weights_open(&m->open[i], m->path[i], e));
+        else if (i != DAR_MODEL_LORA && !o->plan)
+            return dar_fail(e, DAR_ERR_USAGE,
+                            "%s: found no weights of the %s, expected --%s FILE or --weights DIR with "
+                            "%s.safetensors",
+                            m->file, dar_model_part_name[i], dar_model_part_name[i], dar_model_part_name[i]);
+    }
+    return DAR_OK;
+}
+
+/* ---------------------------------------------------------------- what it is */
+
+static dar_status read_file(dar_model *m, const char *channels, dar_err *e)
+{
+    dar_json_doc *doc;
+    DAR_TRY(dar_json_open(&doc, m->file, e));
+    dar_json root = dar_json_root(doc), condition = dar_json_object(root, "condition");
+    bool said = dar_json_get(condition, "channels").item != NULL;
+    dar_config_read(&m->c, root);
+    dar_condition_read(&m->condition, condition);
+    dar_status s = dar_json_finish(doc, e);
+    dar_json_close(doc);
+    if (s != DAR_OK) return s;
+    if (!channels && !said && m->c.adapter.geometry == 0) channels = "camera";
+    return channels ? dar_channel_set_parse(&m->condition.set, channels, e) : DAR_OK;
+}
+
+int64_t dar_model_token(const dar_model *m)
+{
+    return dar_vae_shrink(&m->c.vae) * m->c.dit.patch;
+}
+
+/* Whether these networks can be put one behind the other, and take what the channel set gives. */
+static dar_status check(const dar_model *m, dar_err *e)
+{
+    const dar_adapter_config *a = &m->c.adapter;
+    const int64_t frames = dar_vae_shrink_time(&m->c.vae), token = dar_model_token(m);
+    const long long channels = (long long)m->condition.set.channels;
+    if (!m->c.vae.levels)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: found no vae, expected one: frames are its latents", m->file);
+    if (frames != DAR_RAYS_GROUP || (m->c.dit.mask && m->c.dit.mask != frames))
+        return dar_fail(e, DAR_ERR_USAGE, "%s: found vae.halve_time for %lld frames and dit.mask %lld, expected %d",
+                        m->file, (long long)frames, (long long)m->c.dit.mask, DAR_RAYS_GROUP);
+    if (a->rays + a->geometry == 0) return DAR_OK;
+    if (2 * a->unshuffle != token)
+        return dar_fail(e, DAR_ERR_USAGE,
+                        "%s: found adapter.unshuffle %lld, expected %lld: a token is %lld pixels wide", m->file,
+                        (long long)a->unshuffle, (long long)token / 2, (long long)token);
+    if (a->rays != DAR_RAYS_CHANNELS)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: found adapter.rays %lld, expected %d", m->file, (long long)a->rays,
+                        DAR_RAYS_CHANNELS);
+    if (a->geometry != channels)
+        return dar_fail(e, DAR_ERR_USAGE,
+                        "%s: found adapter.geometry %lld, but --channels has %lld: expected the set "
+                        "that the model was trained with",
+                        m->file, (long long)a->geometry, channels);
+    return DAR_OK;
+}
+
+/* ---------------------------------------------------------------- networks */
+
+/* Declare, give values, merge.  Planning, fresh values stand for those of files: what is mapped then counts as memory,
+ * and nothing is told twice. */
+static dar_status build(dar_model *m, const dar_model_options *o, dar_arena *scratch, dar_err *e)
+{
+    dar_params *dit = &m->params[0], *vae = &m->params[1];
+    dar_params_init(dit, &m->weights, o->storage);
+    dar_params_init(vae, &m->weights, o->storage);
+    dar_dit_init(&m->dit, dit, &m->c.dit, &m->c.adapter);
+    dar_vae_init(&m->vae, vae, &m->c.vae);
+    if (m->weights.plan) {
+        dar_params_fresh(dit, DAR_PARAM_ALL, 0);
+        dar_params_fresh(vae, DAR_PARAM_ALL, 0);
+    } else {
+        DAR_TRY(dar_load_dit(&m->dit, dit, m->open[DAR_MODEL_DIT], 0, e));
+        DAR_TRY(dar_load_vae(vae, m->open[DAR_MODEL_VAE], e));
+    }
+    if (m->open[DAR_MODEL_LORA]) {
+        dar_lora_read_options read = { .alpha = m->c.lora.rank ? m->c.lora.alpha : 0, .strength = o->strength };
+        DAR_TRY(dar_lora_read(&m->dit, dit, m->open[DAR_MODEL_LORA], &read, e));
+        if (!o->apart) dar_lora_merge(&m->dit, dit, scratch);
+    }
+    dar_vae_fold(&m->vae, &m->weights);
+    return DAR_OK;
+}
+
+static void drop_networks(dar_model *m)
+{
+    dar_dit_free(&m->dit);
+    for (size_t i = 0; i < DAR_COUNT(m->params); i++) dar_params_free(&m->params[i]);
+    dar_arena_free(&m->weights);
+    memset(&m->dit, 0, sizeof m->dit);
+    memset(&m->vae, 0, sizeof m->vae);
+}
+
+static dar_status load(dar_model *m, const dar_model_options *o, dar_err *e)
+{
+    dar_arena scratch = { 0 };
+    dar_status s = dar_arena_init_plan(&m->weights, "weights", e);
+    if (s == DAR_OK) s = dar_arena_init_plan(&scratch, "merging", e);
+    if (s == DAR_OK) s = build(m, o, &scratch, e);
+    size_t merging = scratch.peak;
+    m->bytes = m->weights.peak;
+    dar_arena_free(&scratch);
+    if (s != DAR_OK || o->plan) return s;
+
+    drop_networks(m);
+    DAR_TRY(dar_arena_init(&m->weights, "weights", m->bytes, e));
+    s = dar_arena_init(&scratch, "merging", merging, e);
+    if (s == DAR_OK) s = build(m, o, &scratch, e);
+    dar_arena_free(&scratch);
+    return s;
+}
+
+dar_status dar_model_open(dar_model **out, const dar_model_options *o, dar_err *e)
+{
+    dar_model *m = calloc(1, sizeof *m);
+    dar_status s = m ? find_file(m, o->model, e) : dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", o->model);
+    if (s == DAR_OK) s = read_file(m, o->channels, e);
+    if (s == DAR_OK) s = check(m, e);
+    if (s == DAR_OK) s = open_parts(m, o, e);
+    if (s == DAR_OK) s = load(m, o, e);
+    if (s != DAR_OK) {
+        dar_model_close(m);
+        m = NULL;
+    }
+    *out = m;
+    return s;
+}
+
+void dar_model_close(dar_model *m)
+{
+    if (!m) return;
+    drop_networks(m);
+    for (int i = 0; i < DAR_MODEL_PARTS; i++) dar_weights_close(m->open[i]);
+    free(m);
+}

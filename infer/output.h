@@ -1,0 +1,42 @@
+/* output.h: the directory that a rendered video becomes.
+ *
+ *   sample.json        how it was made: the same input gives the same text, so it also tells whether the work is done
+ *   frames/00000.png   every frame
+ *   video.mp4          for people
+ *   video.mkv          every frame, exact (FFV1)
+ *   sheet.png          reference, geometry as the network sees it, result, ground truth and distance from it
+ *
+ * It appears whole or not at all (lib/dir.h). */
+#ifndef DAR_INFER_OUTPUT_H
+#define DAR_INFER_OUTPUT_H
+
+#include "data/bundle.h"
+#include "infer/model.h"
+
+typedef struct dar_output_options {
+    bool png, mp4, mkv, sheet;
+    bool overwrite;
+} dar_output_options;
+
+typedef struct dar_output dar_output;
+
+/* Begin.  b, which is read for ground truth, must outlive it; reference [H, W, 3]; cond as the pipeline has it, data
+ * NULL: none.  On failure *out is NULL. */
+dar_status dar_output_create(dar_output **out, const char *path, dar_bundle *b, const dar_condition *condition,
+                             const dar_tensor *cond, const uint8_t *reference, const dar_output_options *o, dar_err *e);
+
+/* The next frame, rgb [H, W, 3]. */
+dar_status dar_output_frame(dar_output *o, size_t index, const uint8_t *rgb, dar_err *e);
+
+/* All are there: finish the files, write sample.json, rename. */
+dar_status dar_output_commit(dar_output *o, const char *settings, dar_err *e);
+
+/* Accepts NULL.  What was not committed is removed. */
+void dar_output_discard(dar_output *o);
+
+typedef enum dar_output_state { DAR_OUTPUT_NONE, DAR_OUTPUT_DONE, DAR_OUTPUT_OTHER } dar_output_state;
+
+/* What is at `path`: nothing, a video of these settings, anything else. */
+dar_output_state dar_output_look(const char *path, const char *settings);
+
+#endif

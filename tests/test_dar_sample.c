@@ -1,0 +1,362 @@
+/* test_dar_sample.c: the program dar-sample as people and scripts meet it: a small bundle and a small model with random
+ * weights in, videos out; what is wrong in one line. */
+#include "tests/run.h"
+
+#include <signal.h>
+#include <time.h>
+
+#include "data/bundle.h"
+#include "data/png.h"
+#include "data/video.h"
+#include "lib/json.h"
+#include "lib/rng.h"
+#include "lib/safetensors_write.h"
+#include "models/dit.h"
+#include "models/vae.h"
+
+#define W      40
+#define H      24
+#define T      9
+#define PIXELS ((size_t)W * H)
+
+static char dir[] = "/tmp/dar-sample-XXXXXX", program[PATH_MAX], bundler[PATH_MAX];
+
+#define RUN(...) RUN_PROGRAM(program, __VA_ARGS__)
+
+/* The options of nearly every run. */
+#define MODEL "--model", "model", "--precision", "f32", "--steps", "2", "--no-mp4"
+
+/* ---------------------------------------------------------------- a model, a bundle */
+
+/* A token is 8 x 8 pixels. */
+static const char model[] = "{\"name\": \"small\","
+                            "\"dit\": {\"width\": 20, \"heads\": 2, \"layers\": 2, \"ffn\": 27, \"latent\": 5,"
+                            "\"frequencies\": 16, \"text_width\": 13, \"text_keys\": 11},"
+                            "\"adapter\": {\"geometry\": 3, \"unshuffle\": 4},"
+                            "\"vae\": {\"patch\": 1, \"multipliers\": [1, 2, 2], \"halve_time\": [true, true],"
+                            "\"encoder_width\": 3, \"decoder_width\": 4, \"encoder_blocks\": 1,"
+                            "\"decoder_blocks\": 1},"
+                            "\"condition\": {\"channels\": \"world\", \"geometry_frame\": \"camera0\"}}";
+
+static void write_weights(const char *path, const dar_params *p)
+{
+    dar_safetensors_item *item = calloc(p->count, sizeof *item);
+    dar_err e;
+    assert_non_null(item);
+    for (size_t i = 0; i < p->count; i++) item[i] = (dar_safetensors_item){ p->at[i]->name, p->at[i]->x };
+    CHECK(dar_safetensors_write(path, item, p->count, NULL, &e) == DAR_OK, "%s", e.text);
+    free(item);
+}
+
+/* Random, none of them zero. */
+static void fill(dar_params *p)
+{
+    dar_params_fresh(p, DAR_PARAM_ALL, 1);
+    for (size_t i = 0; i < p->count; i++) {
+        dar_param *q = p->at[i];
+        if (q->info.law == DAR_FRESH_VALUE)
+            dar_rng_fill_uniform(&q->x, 2, i, q->info.spread - 0.2, q->info.spread + 0.2);
+    }
+}
+
+static void write_model(const char *path)
+{
+    dar_arena a;
+    dar_params dit_params, vae_params;
+    dar_dit dit = { 0 };
+    dar_vae vae = { 0 };
+    dar_config c;
+    dar_condition condition;
+    dar_json_doc *doc;
+    dar_err e;
+    char name[64];
+    assert_int_equal(mkdir(path, 0777), 0);
+    snprintf(name, sizeof name, "%s/model.json", path);
+    run_write(name, model, sizeof model - 1);
+    assert_int_equal(dar_json_open(&doc, name, &e), DAR_OK);
+    dar_config_read(&c, dar_json_root(doc));
+    dar_condition_read(&condition, dar_json_object(dar_json_root(doc), "condition"));
+    CHECK(dar_json_finish(doc, &e) == DAR_OK, "%s", e.text);
+    dar_json_close(doc);
+
+    assert_int_equal(dar_arena_init(&a, "weights", 16 << 20, &e), DAR_OK);
+    dar_params_init(&dit_params, &a, DAR_F32);
+    dar_params_init(&vae_params, &a, DAR_F32);
+    dar_dit_init(&dit, &dit_params, &c.dit, &c.adapter);
+    dar_vae_init(&vae, &vae_params, &c.vae);
+    fill(&dit_params);
+    fill(&vae_params);
+    snprintf(name, sizeof name, "%s/dit.safetensors", path);
+    write_weights(name, &dit_params);
+    snprintf(name, sizeof name, "%s/vae.safetensors", path);
+    write_weights(name, &vae_params);
+    dar_dit_free(&dit);
+    dar_params_free(&dit_params);
+    dar_params_free(&vae_params);
+    dar_arena_free(&a);
+}
+
+static void write_picture(const char *path, int shade)
+{
+    uint8_t rgb[3 * PIXELS];
+    dar_err e;
+    for (size_t i = 0; i < sizeof rgb; i++) rgb[i] = (uint8_t)(i * (size_t)shade);
+    assert_int_equal(dar_png_write(path, W, H, 3, rgb, &e), DAR_OK);
+}
+
+static void write_bundles(void)
+{
+    static const char cube[] = "v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1\n"
+                               "f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 3 4 8\nf 3 8 7\nf 1 5 8\n"
+                               "f 1 8 4\nf 2 3 7\nf 2 7 6\n";
+    static const struct {
+        const char *name, *size, *frames, *families;
+    } made[] = { { "clip", "40x24", "9", "all" },
+                 { "odd", "44x24", "9", "all" },
+                 { "uneven", "40x24", "7", "all" },
+                 { "one", "40x24", "1", "all" },
+                 { "poor", "40x24", "9", "depth" } };
+    run_write("cube.obj", cube, sizeof cube - 1);
+    for (size_t i = 0; i < DAR_COUNT(made); i++) {
+        int status = RUN_PROGRAM(bundler, "render", "cube.obj", "-o", made[i].name, "--size", made[i].size, "--frames",
+                                 made[i].frames, "--families", made[i].families, "--trajectory", "orbit-60");
+        CHECK(status == 0, "%s: %s", made[i].name, ran.err);
+    }
+    assert_int_equal(mkdir("frames", 0777), 0);
+    for (int t = 0; t < T; t++) {
+        char name[32];
+        snprintf(name, sizeof name, "frames/%d.png", t);
+        write_picture(name, 3 + t);
+    }
+    int status =
+        RUN_PROGRAM(bundler, "render", "cube.obj", "-o", "seen", "--size", "40x24", "--frames", "9", "--rgb", "frames");
+    CHECK(status == 0, "%s", ran.err);
+    write_picture("a.png", 7);
+    write_picture("b.png", 11);
+}
+
+/* ---------------------------------------------------------------- what was made */
+
+static double printed(const char *key)
+{
+    dar_json_doc *doc;
+    dar_err e;
+    CHECK(dar_json_parse(&doc, "standard output", ran.out, strlen(ran.out), &e) == DAR_OK, "%s", e.text);
+    double x = dar_json_number(dar_json_root(doc), key, NAN, -1e300, 1e300);
+    dar_json_close(doc);
+    return x;
+}
+
+static void same_frames(const char *a, const char *b)
+{
+    char x[128], y[128];
+    for (int t = 0; t < T; t++) {
+        snprintf(x, sizeof x, "%s/frames/%05d.png", a, t);
+        snprintf(y, sizeof y, "%s/frames/%05d.png", b, t);
+        run_same_file(x, y);
+    }
+}
+
+static bool frames_differ(const char *a, const char *b)
+{
+    char x[128], y[128];
+    dar_file_map m, n;
+    snprintf(x, sizeof x, "%s/frames/%05d.png", a, T - 1);
+    snprintf(y, sizeof y, "%s/frames/%05d.png", b, T - 1);
+    assert_int_equal(dar_file_map_open(&m, x, NULL), DAR_OK);
+    assert_int_equal(dar_file_map_open(&n, y, NULL), DAR_OK);
+    bool same = m.size == n.size && memcmp(m.data, n.data, m.size) == 0;
+    dar_file_map_close(&m);
+    dar_file_map_close(&n);
+    return !same;
+}
+
+/* ---------------------------------------------------------------- tests */
+
+static void a_video(void **state)
+{
+    (void)state;
+    dar_video_info info;
+    dar_video *v;
+    dar_err e;
+    uint8_t rgb[3 * PIXELS];
+    GOOD("seen", "-o", "first", "--model", "model", "--precision", "f32", "--steps", "3", "--mkv", "--json");
+    CHECK_NEAR("videos", printed("done"), 1, 0);
+    assert_true(run_is_there("first/sheet.png") && run_is_there("first/sample.json"));
+    assert_int_equal(dar_video_probe(&info, "first/video.mp4", &e), DAR_OK);
+    assert_true(info.frames == T && info.width == W && info.height == H);
+
+    /* The exact video and the pictures are the same. */
+    assert_int_equal(dar_video_open(&v, &info, "first/video.mkv", &e), DAR_OK);
+    assert_int_equal(info.frames, T);
+    assert_int_equal(mkdir("read", 0777), 0);
+    assert_int_equal(mkdir("read/frames", 0777), 0);
+    for (int t = 0; t < T; t++) {
+        char name[64];
+        CHECK(dar_video_read(v, rgb, &e) == DAR_OK, "%s", e.text);
+        snprintf(name, sizeof name, "read/frames/%05d.png", t);
+        assert_int_equal(dar_png_write(name, W, H, 3, rgb, &e), DAR_OK);
+    }
+    dar_video_close(v);
+    same_frames("first", "read");
+}
+
+static void any_threads(void **state)
+{
+    (void)state;
+    GOOD("clip", "-o", "t1", MODEL, "--reference", "a.png", "--threads", "1");
+    GOOD("clip", "-o", "t2", MODEL, "--reference", "a.png", "--threads", "2");
+    GOOD("clip", "-o", "t3", MODEL, "--reference", "a.png", "--threads", "3");
+    same_frames("t1", "t2");
+    same_frames("t1", "t3");
+    run_same_file("t1/sample.json", "t2/sample.json");
+    GOOD("clip", "-o", "t4", MODEL, "--reference", "a.png", "--seed", "43");
+    assert_true(frames_differ("t1", "t4"));
+
+    /* What is not skipped changes sums by 1e-15, which 8 bits do not show. */
+    GOOD("clip", "-o", "t5", MODEL, "--reference", "a.png", "--precision", "f64");
+    GOOD("clip", "-o", "t6", MODEL, "--reference", "a.png", "--precision", "f64", "--skip", "none");
+    same_frames("t5", "t6");
+}
+
+/* Two bundles and two pictures in one call; each video as if alone.  What is done stays. */
+static void batches(void **state)
+{
+    (void)state;
+    GOOD("clip", "seen", "-o", "all", MODEL, "--reference", "a.png", "--reference", "b.png", "--json");
+    CHECK_NEAR("done", printed("done"), 4, 0);
+    GOOD("clip", "-o", "alone", MODEL, "--reference", "b.png");
+    same_frames("all/clip-b", "alone");
+    run_same_file("all/clip-b/sample.json", "alone/sample.json");
+    assert_true(frames_differ("all/clip-a", "all/clip-b"));
+
+    assert_int_equal(run_remove("all/seen-a"), 0);
+    GOOD("clip", "seen", "-o", "all", MODEL, "--reference", "a.png", "--reference", "b.png", "--json");
+    CHECK_NEAR("done", printed("done"), 1, 0);
+    CHECK_NEAR("kept", printed("kept"), 3, 0);
+
+    BAD(2, "--overwrite", "clip", "-o", "alone", MODEL, "--reference", "a.png");
+    GOOD("clip", "-o", "alone", MODEL, "--reference", "a.png", "--overwrite");
+    same_frames("all/clip-a", "alone");
+}
+
+static void stopped(void **state)
+{
+    (void)state;
+    static const int how[] = { SIGINT, SIGKILL };
+    GOOD("seen", "-o", "whole", "--model", "model", "--steps", "60", "--no-mp4");
+    for (size_t i = 0; i < DAR_COUNT(how); i++) {
+        pid_t pid = run_start(program, (const char *const[]){ "seen", "-o", "cut", "--model", "model", "--steps", "60",
+                                                              "--no-mp4", NULL });
+        nanosleep(&(struct timespec){ .tv_nsec = 60000000 }, NULL);
+        kill(pid, how[i]);
+        int status = run_finish(pid);
+        CHECK(status == (how[i] == SIGINT ? 130 : 128 + SIGKILL) || status == 0, "status %d: %s", status, ran.err);
+        if (status) assert_false(run_is_there("cut/sample.json"));
+    }
+    GOOD("seen", "-o", "cut", "--model", "model", "--steps", "60", "--no-mp4");
+    same_frames("whole", "cut");
+    run_same_file("whole/sample.json", "cut/sample.json");
+}
+
+static void solvers_and_noise(void **state)
+{
+    (void)state;
+    static const char *const solver[] = { "ab2", "unipc", "dpm++" };
+    for (size_t i = 0; i < DAR_COUNT(solver); i++)
+        GOOD("seen", "-o", solver[i], "--model", "model", "--no-mp4", "--no-sheet", "--steps", "3", "--solver",
+             solver[i]);
+    assert_true(frames_differ("ab2", "unipc") && frames_differ("unipc", "dpm++"));
+
+    /* Noise of a file: the numbers that the program itself draws give the same video. */
+    dar_arena a;
+    dar_err e;
+    assert_int_equal(dar_arena_init(&a, "noise", 1 << 20, &e), DAR_OK);
+    dar_safetensors_item item = { "noise", dar_tensor_push(&a, DAR_F32, DAR_SHAPE(5, 3, H / 4, W / 4)) };
+    dar_rng_fill_normal(&item.x, 42, dar_rng_stream("noise"), 1);
+    assert_int_equal(dar_safetensors_write("noise.safetensors", &item, 1, NULL, &e), DAR_OK);
+    GOOD("clip", "-o", "given", MODEL, "--reference", "a.png", "--noise", "noise.safetensors");
+    same_frames("given", "t1");
+    GOOD("clip", "-o", "torch", MODEL, "--reference", "a.png", "--noise", "torch");
+    assert_true(frames_differ("torch", "t1"));
+    item.x = dar_tensor_of(DAR_F32, DAR_SHAPE(5, 2, H / 4, W / 4), item.x.data);
+    assert_int_equal(dar_safetensors_write("short.safetensors", &item, 1, NULL, &e), DAR_OK);
+    BAD(2, "expected [1, 5, 3, 6, 10]", "clip", "-o", "x", MODEL, "--reference", "a.png", "--noise",
+        "short.safetensors");
+
+    /* A prompt matters, through guidance too. */
+    item = (dar_safetensors_item){ "text", dar_tensor_push(&a, DAR_F32, DAR_SHAPE(4, 13)) };
+    dar_rng_fill_uniform(&item.x, 1, 1, -3, 3);
+    assert_int_equal(dar_safetensors_write("text.safetensors", &item, 1, NULL, &e), DAR_OK);
+    GOOD("clip", "-o", "told", MODEL, "--reference", "a.png", "--text", "text.safetensors");
+    GOOD("clip", "-o", "told1", MODEL, "--reference", "a.png", "--text", "text.safetensors", "--guidance", "1");
+    GOOD("clip", "-o", "equal", MODEL, "--reference", "a.png", "--text", "text.safetensors", "--negative",
+         "text.safetensors");
+    assert_true(frames_differ("told", "t1") && frames_differ("told", "told1"));
+    same_frames("equal", "told1");
+    dar_arena_free(&a);
+}
+
+static void dry_run(void **state)
+{
+    (void)state;
+    GOOD("clip", "seen", "-o", "never", MODEL, "--dry-run");
+    assert_non_null(strstr(ran.out, "GB of memory"));
+    assert_non_null(strstr(ran.out, "without skipping scene"));
+    assert_false(run_is_there("never"));
+    GOOD("--version");
+    GOOD("--help");
+}
+
+static void refusals(void **state)
+{
+    (void)state;
+    BAD(2, "expected -o DIR", "clip", MODEL);
+    BAD(2, "expected --model", "clip", "-o", "x");
+    BAD(2, "preset", "clip", "-o", "x", "--model", "nothing");
+    BAD(2, "no vae", "clip", "-o", "x", "--model", "dar-tiny");
+    BAD(2, "--dit FILE", "clip", "-o", "x", "--model", "wan22-fun-5b");
+    BAD(2, "nowhere: No such", "nowhere", "-o", "x", MODEL);
+    BAD(2, "expected 1, 5, 9", "uneven", "-o", "x", MODEL, "--reference", "a.png");
+    BAD(2, "expected 5, 9, 13", "one", "-o", "x", MODEL, "--reference", "a.png");
+    BAD(2, "--reference IMG", "clip", "-o", "x", MODEL);
+    BAD(2, "world", "poor", "-o", "x", MODEL, "--reference", "a.png");
+    BAD(2, "adapter.geometry 3", "clip", "-o", "x", MODEL, "--channels", "dar");
+    BAD(2, "found 'pas'", "clip", "-o", "x", MODEL, "--no-skip", "pas");
+    BAD(2, "one name", "clip", "./clip/", "-o", "x", MODEL);
+    BAD(2, "one name", "clip", "-o", "x", MODEL, "--reference", "a.png", "--reference", "frames/../a.png");
+    assert_int_equal(
+        RUN_PROGRAM(bundler, "render", "cube.obj", "-o", "wide", "--size", "44x24", "--frames", "9", "--rgb", "frames"),
+        2);
+    BAD(2, "--size 48x24", "odd", "-o", "x", MODEL, "--dry-run");
+    assert_false(run_is_there("x"));
+
+    /* Weights of another network. */
+    BAD(2, "vae.safetensors", "seen", "-o", "x", MODEL, "--dit", "model/vae.safetensors");
+}
+
+static int in_directory(void **state)
+{
+    (void)state;
+    if (!mkdtemp(dir) || chdir(dir) != 0) return 1;
+    write_model("model");
+    write_bundles();
+    return 0;
+}
+
+static int remove_directory(void **state)
+{
+    (void)state;
+    return chdir("/") != 0 || run_remove(dir) != 0;
+}
+
+int main(int argc, char **argv)
+{
+    static const struct CMUnitTest tests[] = {
+        cmocka_unit_test(a_video),  cmocka_unit_test(any_threads),       cmocka_unit_test(batches),
+        cmocka_unit_test(stopped),  cmocka_unit_test(solvers_and_noise), cmocka_unit_test(dry_run),
+        cmocka_unit_test(refusals),
+    };
+    if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
+    return cmocka_run_group_tests_name("dar-sample", tests, in_directory, remove_directory) != 0;
+}
