@@ -129,10 +129,10 @@ int64_t dar_model_token(const dar_model *m)
 static dar_status check(const dar_model *m, dar_err *e)
 {
     const dar_adapter_config *a = &m->c.adapter;
-    const int64_t frames = dar_vae_shrink_time(&m->c.vae), token = dar_model_token(m);
     const long long channels = (long long)m->condition.set.channels;
     if (!m->c.vae.levels)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found no vae, expected one: frames are its latents", m->file);
+    const int64_t frames = dar_vae_shrink_time(&m->c.vae), token = dar_model_token(m);
     if (frames != DAR_RAYS_GROUP || (m->c.dit.mask && m->c.dit.mask != frames))
         return dar_fail(e, DAR_ERR_USAGE, "%s: found vae.halve_time for %lld frames and dit.mask %lld, expected %d",
                         m->file, (long long)frames, (long long)m->c.dit.mask, DAR_RAYS_GROUP);
