@@ -57,9 +57,11 @@ static dar_status find_file(dar_model *m, const char *model, dar_err *e)
     ssize_t k = readlink("/proc/self/exe", program, sizeof program - 1);
     if (k > 0) {
         program[k] = 0;
-        for (int i = 0; i < 3; i++) directory_of(program);
-        join(m->file, program, name);
-        if (is_there(m->file)) return DAR_OK;
+        for (int i = 0; i < 4; i++) { /* build/MODE/dar-sample, or one deeper */
+            directory_of(program);
+            join(m->file, program, name);
+            if (is_there(m->file)) return DAR_OK;
+        }
     }
     return dar_fail(e, DAR_ERR_USAGE,
                     "--model: found '%s', expected a directory with a model.json, a .json file or the "
