@@ -4,19 +4,8 @@
 
 #include "autograd/gradcheck.h"
 #include "lib/rng.h"
+#include "tests/distance.h"
 #include "tests/model.h"
-
-/* Largest deviation over the largest value. */
-static double distance(const dar_tensor *x, const dar_tensor *y)
-{
-    double most = 0, off = 0;
-    for (size_t i = 0; i < dar_tensor_count(y); i++) {
-        double a = dar_dtype_get(x->dtype, x->data, i), b = dar_dtype_get(y->dtype, y->data, i);
-        if (!(fabs(a - b) <= off)) off = fabs(a - b);
-        most = fmax(most, fabs(b));
-    }
-    return off / most;
-}
 
 /* ---------------------------------------------------------------- parity */
 
@@ -69,7 +58,7 @@ static void compare(struct parity *p, const char *name, const dar_tensor *x, dou
     CHECK(dar_weights_tensor(p->stages, name, &y, &e) == DAR_OK, "%s", e.text);
     CHECK(dar_tensor_count(x) == dar_tensor_count(&y), "%s: %zu numbers, expected %zu", name, dar_tensor_count(x),
           dar_tensor_count(&y));
-    double d = distance(x, &y);
+    double d = test_relative(x, &y);
     CHECK_NEAR(name, d, 0, bound);
     *worst = fmax(*worst, d);
 }
@@ -94,7 +83,7 @@ static void text_stage(struct parity *p, const char *what, int block, const dar_
             there = dar_tensor_narrow(&y, 0, b, 1);
             here = dar_tensor_narrow(&here, 1, row, 1);
             there = dar_tensor_narrow(&there, 1, i, 1);
-            double d = distance(&here, &there);
+            double d = test_relative(&here, &there);
             CHECK_NEAR(name, d, 0, p->bound);
             p->worst = fmax(p->worst, d);
         }

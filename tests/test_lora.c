@@ -5,20 +5,12 @@
 
 #include "lib/rng.h"
 #include "lib/safetensors_write.h"
+#include "tests/distance.h"
 #include "tests/model.h"
 
 static double at(const dar_tensor *x, size_t i)
 {
     return dar_dtype_get(x->dtype, x->data, i);
-}
-
-static double distance(const dar_tensor *x, const dar_tensor *y)
-{
-    double off = 0;
-    assert_int_equal(dar_tensor_count(x), dar_tensor_count(y));
-    for (size_t i = 0; i < dar_tensor_count(x); i++)
-        if (!(fabs(at(x, i) - at(y, i)) <= off)) off = fabs(at(x, i) - at(y, i));
-    return off;
 }
 
 static void randomise(dar_param *q, uint64_t stream)
@@ -87,12 +79,12 @@ static void merged_is_the_same(void **state)
         dar_tensor_copy(&old, &w->x);
         dar_lora_merge(&o.m, &o.p, &o.step);
         dar_tensor merged = velocity(&o);
-        CHECK(distance(&w->x, &old) > 0.01, "nothing was merged");
-        CHECK_NEAR("merged", distance(&merged, &before), 0, bound[type]);
+        CHECK(test_distance(&w->x, &old, NULL) > 0.01, "nothing was merged");
+        CHECK_NEAR("merged", test_distance(&merged, &before, NULL), 0, bound[type]);
         dar_lora_merge(&o.m, &o.p, &o.step); /* it is already */
         dar_lora_unmerge(&o.m, &o.step);
         double eps = type == DAR_F64 ? 0x1p-53 : type == DAR_F32 ? 0x1p-24 : 0x1p-9;
-        CHECK_NEAR("taken back", distance(&w->x, &old), 0, 4 * eps);
+        CHECK_NEAR("taken back", test_distance(&w->x, &old, NULL), 0, 4 * eps);
         model_free(&o);
     }
 }
@@ -118,7 +110,7 @@ static void mapped_weights_come_back(void **state)
         CHECK(w->x.data != base.data, "a mapped weight is not copied");
         CHECK(i == 0 || view.weights.used == used, "merging again takes memory again");
         dar_tensor merged = velocity(&view);
-        CHECK(distance(&merged, &before) > 0, "nothing was merged");
+        CHECK(test_distance(&merged, &before, NULL) > 0, "nothing was merged");
         dar_lora_unmerge(&view.m, &view.step);
         CHECK(w->x.data == base.data, "the mapped weight is not back");
         dar_tensor after = velocity(&view);

@@ -6,19 +6,8 @@
 #include "lib/rng.h"
 #include "lib/rng_torch.h"
 #include "lib/thread.h"
+#include "tests/distance.h"
 #include "tests/model.h"
-
-/* Largest deviation over the largest value. */
-static double distance(const dar_tensor *x, const dar_tensor *y)
-{
-    double most = 0, off = 0;
-    for (size_t i = 0; i < dar_tensor_count(y); i++) {
-        double a = dar_dtype_get(x->dtype, x->data, i), b = dar_dtype_get(y->dtype, y->data, i);
-        if (!(fabs(a - b) <= off)) off = fabs(a - b);
-        most = fmax(most, fabs(b));
-    }
-    return off / most;
-}
 
 static dar_weights *open_fixture(const char *path)
 {
@@ -99,8 +88,9 @@ static dar_status look(void *ctx, size_t done, const dar_tensor *z, dar_err *e)
         dar_tensor y;
         snprintf(name, sizeof name, "step.%zu", done);
         assert_int_equal(dar_weights_tensor(w->steps, name, &y, e), DAR_OK);
-        w->worst = fmax(w->worst, distance(z, &y));
-        CHECK(w->worst >= 0, "step %zu is not finite", done);
+        double off = test_relative(z, &y);
+        CHECK(off >= 0, "step %zu is not finite", done);
+        w->worst = fmax(w->worst, off);
     }
     return done == w->stop ? dar_fail(e, DAR_ERR_INTERRUPTED, "enough") : DAR_OK;
 }
@@ -165,7 +155,7 @@ static void skips_change_nothing(void **state)
         w = (struct walk){ 0 };
         b.c.skip = k == DAR_SKIP_LORA ? 0 : DAR_SKIPS_ALL & ~(1u << k);
         dar_tensor without = sample(&b, &w, &calls);
-        double off = distance(&without, &with);
+        double off = test_relative(&without, &with);
         printf("sampler: without %s: %.2g\n", k == DAR_SKIP_LORA ? "any skip" : dar_skip_name[k], off);
         CHECK_NEAR("latent", off, 0, 1e-5);
         assert_int_equal(calls, 10);
@@ -191,7 +181,7 @@ static void equal_prompts_are_one(void **state)
     b.c.guidance = 3, b.c.skip &= ~(1u << DAR_SKIP_PASS), w.seen = 0;
     dar_tensor both = sample(&b, &w, &calls);
     assert_int_equal(calls, 10);
-    CHECK_NEAR("both passes", distance(&both, &one), 0, 1e-5);
+    CHECK_NEAR("both passes", test_relative(&both, &one), 0, 1e-5);
 
     b.clip.text[0] = b.clip.text[1] = (dar_tensor){ 0 }; /* no token is equal to no token */
     b.c.skip = DAR_SKIPS_ALL, w.seen = 0;
@@ -242,7 +232,7 @@ static void prepared_once(void **state)
         assert_int_equal(dar_sampler_run(&s, other ? NULL : &b.known, other ? NULL : &b.first, &z, NULL, NULL, &e),
                          DAR_OK);
         if (!other) same_bits(&z, &alone);
-        else CHECK(distance(&z, &alone) > 1e-3, "the known video does not matter");
+        else CHECK(test_relative(&z, &alone) > 1e-3, "the known video does not matter");
     }
     dar_sampler_free(&s);
     drop(&b);
@@ -305,7 +295,7 @@ static void noise(void **state)
     for (int kind = DAR_NOISE_OWN; kind <= DAR_NOISE_TORCH; kind++) {
         dar_sampler_noise((dar_noise)kind, 42, &x, &a);
         dar_sampler_noise((dar_noise)kind, 42, &y, &a);
-        CHECK_NEAR("f32 and f64", distance(&x, &y), 0, kind == DAR_NOISE_TORCH ? 0 : 6e-8);
+        CHECK_NEAR("f32 and f64", test_relative(&x, &y), 0, kind == DAR_NOISE_TORCH ? 0 : 6e-8);
     }
     dar_tensor z = dar_tensor_push(&a, DAR_F32, shape);
     dar_rng_torch_seed(&g, 42);
@@ -313,7 +303,7 @@ static void noise(void **state)
     same_bits(&x, &z);
     dar_sampler_noise(DAR_NOISE_OWN, 43, &z, &a);
     dar_sampler_noise(DAR_NOISE_OWN, 42, &x, &a);
-    CHECK(distance(&x, &z) > 0.1, "seeds do not matter");
+    CHECK(test_relative(&x, &z) > 0.1, "seeds do not matter");
     dar_arena_free(&a);
 }
 

@@ -5,21 +5,12 @@
 #include "autograd/ops.h"
 #include "lib/rng.h"
 #include "models/patch.h"
+#include "tests/distance.h"
 #include "tests/model.h"
 
 static double at(const dar_tensor *x, size_t i)
 {
     return dar_dtype_get(x->dtype, x->data, i);
-}
-
-static double distance(const dar_tensor *x, const dar_tensor *y)
-{
-    double off = 0;
-    CHECK(dar_tensor_count(x) == dar_tensor_count(y), "%zu numbers, expected %zu", dar_tensor_count(x),
-          dar_tensor_count(y));
-    for (size_t i = 0; i < dar_tensor_count(x); i++)
-        if (!(fabs(at(x, i) - at(y, i)) <= off)) off = fabs(at(x, i) - at(y, i));
-    return off;
 }
 
 static dar_tensor copy(dar_arena *a, const dar_tensor *x)
@@ -66,7 +57,7 @@ static void padding_is_one_key(void **state)
         o.count[b] = keys;
     }
     o.text = all;
-    CHECK_NEAR("velocity", distance(&model_velocity(&o)->x, &folded), 0, 1e-13);
+    CHECK_NEAR("velocity", test_distance(&model_velocity(&o)->x, &folded, NULL), 0, 1e-13);
     model_free(&o);
 }
 
@@ -78,7 +69,7 @@ static void no_text_is_all_padding(void **state)
     o.count[0] = o.count[1] = 0;
     dar_tensor none = copy(&o.weights, &model_velocity(&o)->x);
     o.text = dar_tensor_push(&o.weights, DAR_F64, DAR_SHAPE(2, 0, o.c.dit.text_width));
-    CHECK_NEAR("velocity", distance(&model_velocity(&o)->x, &none), 0, 1e-14);
+    CHECK_NEAR("velocity", test_distance(&model_velocity(&o)->x, &none, NULL), 0, 1e-14);
     model_free(&o);
 }
 
@@ -149,7 +140,7 @@ static void time_zero_is_the_bias_path(void **state)
     dar_val *h = dar_linear(t, s, dar_param_leaf(t, o.m.time_w[0]), dar_param_leaf(t, o.m.time_b[0]), NULL);
     h = dar_linear(t, dar_silu(t, h), dar_param_leaf(t, o.m.time_w[1]), dar_param_leaf(t, o.m.time_b[1]), NULL);
     assert_int_equal(dar_tensor_count(&e.e->x), D);
-    CHECK_NEAR("e", distance(&e.e->x, &h->x), 0, 0);
+    CHECK_NEAR("e", test_distance(&e.e->x, &h->x, NULL), 0, 0);
     model_free(&o);
 }
 
@@ -169,10 +160,10 @@ static void rows_of_times(void **state)
     dar_val *z = dar_leaf(t, o.z, NULL), *v[5];
     const dar_dit_time time[] = { { equal, 1 }, { equal, 2 }, { equal, 3 }, { first, 2 }, { frames, 3 } };
     for (int i = 0; i < 5; i++) v[i] = dar_dit_forward(t, &o.m, &s, &x, z, &time[i]);
-    CHECK_NEAR("2 rows", distance(&v[1]->x, &v[0]->x), 0, 1e-13);
-    CHECK_NEAR("3 rows", distance(&v[2]->x, &v[0]->x), 0, 1e-13);
-    CHECK_NEAR("first frame", distance(&v[4]->x, &v[3]->x), 0, 1e-13);
-    CHECK(distance(&v[3]->x, &v[0]->x) > 1e-3, "times change nothing");
+    CHECK_NEAR("2 rows", test_distance(&v[1]->x, &v[0]->x, NULL), 0, 1e-13);
+    CHECK_NEAR("3 rows", test_distance(&v[2]->x, &v[0]->x, NULL), 0, 1e-13);
+    CHECK_NEAR("first frame", test_distance(&v[4]->x, &v[3]->x, NULL), 0, 1e-13);
+    CHECK(test_distance(&v[3]->x, &v[0]->x, NULL) > 1e-3, "times change nothing");
     model_free(&o);
 }
 
@@ -199,7 +190,7 @@ static void polarity_of_the_masks(void **state)
                     CHECK_NEAR("mask", at(&y, (size_t)((k * F + f) * HW + i)), run ? is[k][f] : f == 0, 0);
         dar_tensor video = dar_tensor_narrow(&y, 1, MASK, C);
         video = copy(&o.weights, &video);
-        CHECK_NEAR("known video", distance(&video, &latent), 0, 0);
+        CHECK_NEAR("known video", test_distance(&video, &latent, NULL), 0, 0);
     }
 
     dar_tensor z = dar_tensor_push(&o.weights, DAR_F32, latent.shape);
@@ -270,7 +261,7 @@ static void clips_are_independent(void **state)
     dar_dit_text_prepare(&o.tape, &o.m, &text, &o.count[1], &x);
     dar_val *v =
         dar_dit_forward(&o.tape, &o.m, &s, &x, dar_leaf(&o.tape, z, NULL), &(dar_dit_time){ model_times + 2, 2 });
-    CHECK_NEAR("velocity", distance(&v->x, &second), 0, 1e-13);
+    CHECK_NEAR("velocity", test_distance(&v->x, &second, NULL), 0, 1e-13);
     model_free(&o);
 }
 

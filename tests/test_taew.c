@@ -5,6 +5,7 @@
 #include "lib/weights.h"
 #include "models/load.h"
 #include "models/taew.h"
+#include "tests/distance.h"
 
 /* Widths of scripts/make-taew-fixtures.py. */
 static const dar_taew_config small = { .latent = 5, .encoder_width = 6, .decoder_width = { 8, 7, 6, 4 } };
@@ -74,20 +75,6 @@ static dar_val *input(net *n, const dar_tensor *x)
     return v;
 }
 
-/* Largest distance over the largest value. */
-static double distance(const dar_tensor *a, const dar_tensor *b)
-{
-    size_t count = dar_tensor_count(a);
-    double off = 0, most = 0;
-    assert_true(dar_shape_equal(&a->shape, &b->shape));
-    for (size_t i = 0; i < count; i++) {
-        double x = dar_dtype_get(a->dtype, a->data, i), y = dar_dtype_get(b->dtype, b->data, i);
-        if (!(fabs(x - y) <= off)) off = fabs(x - y);
-        most = fmax(most, fabs(y));
-    }
-    return off / most;
-}
-
 /* ---------------------------------------------------------------- against the formulas */
 
 static void parity(void **state)
@@ -102,8 +89,8 @@ static void parity(void **state)
     for (size_t i = 0; i < DAR_COUNT(runs); i++) {
         net n;
         net_init(&n, runs[i].type);
-        double d[] = { distance(&dar_taew_encode(&n.tape, &n.v, input(&n, &x))->x, &latent),
-                       distance(&dar_taew_decode(&n.tape, &n.v, input(&n, &z))->x, &pixels) };
+        double d[] = { test_relative(&dar_taew_encode(&n.tape, &n.v, input(&n, &x))->x, &latent),
+                       test_relative(&dar_taew_decode(&n.tape, &n.v, input(&n, &z))->x, &pixels) };
         printf("%s: latent %.1e, pixels %.1e\n", dar_dtype_name(runs[i].type), d[0], d[1]);
         for (int k = 0; k < 2; k++) CHECK_NEAR(dar_dtype_name(runs[i].type), d[k], 0, runs[i].bound);
         net_free(&n);

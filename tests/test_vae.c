@@ -6,6 +6,7 @@
 #include "lib/weights.h"
 #include "models/tiles.h"
 #include "models/vae.h"
+#include "tests/distance.h"
 
 typedef struct net {
     dar_config c;
@@ -75,20 +76,6 @@ static dar_val *input(net *n, const dar_tensor *x)
     return v;
 }
 
-/* Largest distance over the largest value. */
-static double distance(const dar_tensor *a, const dar_tensor *b)
-{
-    size_t count = dar_tensor_count(a);
-    double off = 0, most = 0;
-    assert_int_equal(count, dar_tensor_count(b));
-    for (size_t i = 0; i < count; i++) {
-        double x = dar_dtype_get(a->dtype, a->data, i), y = dar_dtype_get(b->dtype, b->data, i);
-        if (!(fabs(x - y) <= off)) off = fabs(x - y);
-        most = fmax(most, fabs(y));
-    }
-    return off / most;
-}
-
 /* ---------------------------------------------------------------- against the reference */
 
 static void parity(void **state)
@@ -109,8 +96,8 @@ static void parity(void **state)
         dar_val *y = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
         dar_vae_fold(&n.v, &n.weights);
         dar_val *folded = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
-        double d[] = { distance(&m->x, &moments), distance(&latent->x, &z), distance(&y->x, &pixels),
-                       distance(&folded->x, &pixels) };
+        double d[] = { test_relative(&m->x, &moments), test_relative(&latent->x, &z), test_relative(&y->x, &pixels),
+                       test_relative(&folded->x, &pixels) };
         printf("%s: moments %.1e, latent %.1e, pixels %.1e, folded %.1e\n", dar_dtype_name(runs[i].type), d[0], d[1],
                d[2], d[3]);
         for (int k = 0; k < 4; k++) CHECK_NEAR(dar_dtype_name(runs[i].type), d[k], 0, runs[i].bound);
@@ -146,7 +133,7 @@ static void gradients(void **state)
             char name[128];
             snprintf(name, sizeof name, "grad.%s", n.p.at[k]->name);
             dar_tensor g = stage(s, name);
-            double d = distance(&n.p.at[k]->g, &g);
+            double d = test_relative(&n.p.at[k]->g, &g);
             CHECK(d <= runs[i].bound, "%s: %.2e", name, d);
             worst = fmax(worst, d);
         }
