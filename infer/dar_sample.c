@@ -76,7 +76,7 @@ static const dar_option options[] = {
     { .name = "skip", .placeholder = "WHICH", .type = DAR_ARG_CHOICE, .target = &o.skip, .standard = "exact",
       .names = skip_names, .help = "work that need not be done: exact: all that changes nothing; none" },
     { .name = "no-skip", .placeholder = "NAME", .type = DAR_ARG_LIST, .target = &o.no_skip,
-      .help = "all but pass, scene, text, times, padding, lora or repeat (infer/sampler.h)" },
+      .help = "all but pass, scene, text, times, padding, lora or repeat (models/sampler.h)" },
 
     { .help = "Files" },
     { .name = "no-png", .type = DAR_ARG_FLAG, .target = &o.no_png, .help = "no frames/00000.png ..." },

@@ -10,7 +10,7 @@
 
 #include "data/bundle.h"
 #include "infer/model.h"
-#include "infer/sampler.h"
+#include "models/sampler.h"
 
 typedef struct dar_pipeline_options {
     dar_sampler_config sampler;

@@ -2,7 +2,7 @@
  * whatever the numbers are: skips, guidance, threads, planning. */
 #include "tests/test.h"
 
-#include "infer/sampler.h"
+#include "models/sampler.h"
 #include "lib/rng.h"
 #include "lib/rng_torch.h"
 #include "lib/thread.h"

@@ -1,5 +1,5 @@
 /* sampler.c: see sampler.h. */
-#include "infer/sampler.h"
+#include "models/sampler.h"
 
 #include <string.h>
 

@@ -15,8 +15,8 @@
  *
  * One clip at a time; the same bits for any number of threads.  Source: the paper, section 4.3; Ho and Salimans 2022,
  * eq. 6 (guidance). */
-#ifndef DAR_INFER_SAMPLER_H
-#define DAR_INFER_SAMPLER_H
+#ifndef DAR_MODELS_SAMPLER_H
+#define DAR_MODELS_SAMPLER_H
 
 #include "models/dit.h"
 #include "models/solver.h"
