@@ -1,71 +1,21 @@
 /* test_bundle.c: bundles: what is written comes back within the stated quantum, whole or not at all. */
-#include "tests/test.h"
+#include "tests/scratch.h"
 
 #include <dirent.h>
-#include <fcntl.h>
-#include <ftw.h>
-#include <spawn.h>
 #include <sys/file.h>
-#include <sys/stat.h>
 #include <sys/time.h>
-#include <sys/wait.h>
-#include <unistd.h>
 
 #include "data/bundle.h"
 #include "data/bundle_exr.h"
 #include "data/h5.h"
 #include "data/tracks.h"
-#include "lib/file.h"
 #include "tests/made.h"
-
-extern char **environ;
 
 #define W      74
 #define H      46
 #define PIXELS ((size_t)W * H)
 #define T      5
 #define TRACKS 20
-
-static char dir[] = "/tmp/dar-bundle-XXXXXX";
-
-static const char *in_dir(const char *name)
-{
-    static char path[4][512];
-    static int which;
-    which = (which + 1) % 4;
-    snprintf(path[which], sizeof path[which], "%s/%s", dir, name);
-    return path[which];
-}
-
-static void ok(dar_status s, const dar_err *e)
-{
-    CHECK(s == DAR_OK, "refused: %s", e->text);
-}
-
-static void refused(dar_status found, const dar_err *e, const char *says)
-{
-    CHECK(found != DAR_OK, "accepted, expected: %s", says);
-    CHECK(strstr(e->text, says), "message: %s; expected: %s", e->text, says);
-}
-
-static bool is_there(const char *path)
-{
-    struct stat st;
-    return lstat(path, &st) == 0;
-}
-
-static int remove_entry(const char *path, const struct stat *st, int type, struct FTW *at)
-{
-    (void)st;
-    (void)type;
-    (void)at;
-    return remove(path);
-}
-
-static void remove_tree(const char *path)
-{
-    nftw(path, remove_entry, 8, FTW_DEPTH | FTW_PHYS);
-}
 
 /* ---------------------------------------------------------------- a clip */
 
@@ -276,7 +226,8 @@ static void round_trip(void **state)
     check_families(b, &made, made.world.size / 65535);
     check_pictures(b, &made);
     ok(dar_bundle_verify(b, &e), &e);
-    CHECK(is_there(in_dir("a/video.mp4")) && is_there(in_dir("a/transforms.json")) && is_there(in_dir("a/cameras.txt")),
+    CHECK(run_is_there(in_dir("a/video.mp4")) && run_is_there(in_dir("a/transforms.json")) &&
+              run_is_there(in_dir("a/cameras.txt")),
           "video or exports are missing");
     dar_bundle_close(b);
 
@@ -360,15 +311,6 @@ static void condition(void **state)
 
 /* ---------------------------------------------------------------- bundles of other tools */
 
-static void write_text(const char *path, const char *text)
-{
-    dar_file_out out;
-    dar_err e;
-    ok(dar_file_create(&out, path, &e), &e);
-    ok(dar_file_write(&out, text, strlen(text), &e), &e);
-    ok(dar_file_commit(&out, &e), &e);
-}
-
 #define SIZES "\"format\":\"dar-bundle/1\",\"width\":74,\"height\":46,\"frames\":5,\"fps\":24"
 
 /* Depth and normals in f32, no mask, nothing else said. */
@@ -385,8 +327,8 @@ static void of_others(void **state)
     dar_h5 *f;
     dar_err e;
     CHECK(mkdir(in_dir("others"), 0777) == 0, "mkdir");
-    write_text(in_dir("others/meta.json"),
-               "{" SIZES ",\"families\":{\"depth\":{\"type\":\"f32\"},\"normal\":{\"type\":\"f32\"}}}");
+    scratch_text(in_dir("others/meta.json"),
+                 "{" SIZES ",\"families\":{\"depth\":{\"type\":\"f32\"},\"normal\":{\"type\":\"f32\"}}}");
     ok(dar_camera_io_write(&made.cameras, in_dir("others/cameras.json"), DAR_CAMERA_JSON, &o, &e), &e);
     ok(dar_h5_create(&f, in_dir("others/gbuffer.h5"), &e), &e);
     ok(dar_h5_make(f, "depth", &a, &e), &e);
@@ -441,11 +383,11 @@ static void lies(void **state)
     dar_bundle *b;
     dar_err e;
     for (size_t i = 0; i < DAR_COUNT(row); i++) {
-        write_text(in_dir("others/meta.json"), row[i].meta);
+        scratch_text(in_dir("others/meta.json"), row[i].meta);
         dar_status s = dar_bundle_open(&b, in_dir("others"), &e);
         if (s == DAR_OK) s = dar_bundle_values(b, DAR_FAMILY_DEPTH, 0, y, &e);
         refused(s, &e, row[i].says);
-        CHECK(strstr(e.text, dir), "names no file: %s", e.text);
+        CHECK(strstr(e.text, scratch_dir), "names no file: %s", e.text);
         dar_bundle_close(b);
     }
     refused(dar_bundle_open(&b, in_dir("none"), &e), &e, "none: No such file");
@@ -474,15 +416,15 @@ static void atomic(void **state)
     dar_bundle *b;
     dar_err e;
     const char *path = in_dir("once");
-    size_t before = entries(dir);
+    size_t before = entries(scratch_dir);
     ok(dar_bundle_create(&w, path, &m, &made.cameras, &o, &e), &e);
     ok(dar_bundle_add(w, &f, &e), &e);
-    CHECK(!is_there(path) && entries(dir) == before + 1, "there before commit");
+    CHECK(!run_is_there(path) && entries(scratch_dir) == before + 1, "there before commit");
     ok(dar_bundle_create(&other, path, &m, &made.cameras, &o, &e), &e);
-    CHECK(entries(dir) == before + 2, "one writer swept away another that lives");
+    CHECK(entries(scratch_dir) == before + 2, "one writer swept away another that lives");
     dar_bundle_discard(other);
     dar_bundle_discard(w);
-    CHECK(entries(dir) == before, "something is left");
+    CHECK(entries(scratch_dir) == before, "something is left");
 
     ok(write_clip(&made, path, &o, &e), &e);
     refused(write_clip(&made, path, &o, &e), &e, "once: is there already");
@@ -490,11 +432,12 @@ static void atomic(void **state)
     o.exports = false;
     ok(write_clip(&made, in_dir("once/"), &o, &e), &e);
     ok(dar_bundle_open(&b, path, &e), &e);
-    CHECK(!is_there(in_dir("once/cameras.txt")), "not replaced");
+    CHECK(!run_is_there(in_dir("once/cameras.txt")), "not replaced");
     dar_bundle_close(b);
-    write_text(in_dir("once/thesis.txt"), "the only copy");
+    scratch_text(in_dir("once/thesis.txt"), "the only copy");
     refused(write_clip(&made, path, &o, &e), &e, "holds thesis.txt, which is no part of a bundle");
-    CHECK(is_there(in_dir("once/thesis.txt")) && entries(dir) == before + 1, "what is left of a refused writer");
+    CHECK(run_is_there(in_dir("once/thesis.txt")) && entries(scratch_dir) == before + 1,
+          "what is left of a refused writer");
 }
 
 /* What came to the target's place while a bundle was written is not replaced unasked, be it empty. */
@@ -516,7 +459,7 @@ static void race(void **state)
     CHECK(rmdir(in_dir("race")) == 0, "an empty directory was replaced");
     ok(dar_bundle_commit(w[1], &e), &e);
     for (int i = 0; i < 2; i++) dar_bundle_discard(w[i]);
-    CHECK(is_there(in_dir("race/meta.json")), "the winner's bundle is gone");
+    CHECK(run_is_there(in_dir("race/meta.json")), "the winner's bundle is gone");
 }
 
 /* A directory that nobody holds locked is what a killed writer leaves. */
@@ -527,10 +470,10 @@ static void leftovers(void **state)
     dar_err e;
     CHECK(mkdir(in_dir("left.tmp-1-0"), 0777) == 0 && mkdir(in_dir("left.tmp-1-0/exr"), 0777) == 0, "mkdir");
     CHECK(mkdir(in_dir("leftover.tmp-1-0"), 0777) == 0, "mkdir");
-    write_text(in_dir("left.tmp-1-0/exr/00000.exr"), "half");
+    scratch_text(in_dir("left.tmp-1-0/exr/00000.exr"), "half");
     ok(write_clip(&made, in_dir("left"), &o, &e), &e);
-    CHECK(!is_there(in_dir("left.tmp-1-0")), "the leftover is there");
-    CHECK(is_there(in_dir("leftover.tmp-1-0")), "another target's is gone");
+    CHECK(!run_is_there(in_dir("left.tmp-1-0")), "the leftover is there");
+    CHECK(run_is_there(in_dir("leftover.tmp-1-0")), "another target's is gone");
 }
 
 /* A program that writes this clip, killed at any moment. */
@@ -553,8 +496,8 @@ static void killed(void **state)
         died += WIFSIGNALED(status) != 0;
         done += WIFEXITED(status) && WEXITSTATUS(status) == 0;
         CHECK(!WIFEXITED(status) || WEXITSTATUS(status) == 0, "the writer failed by itself");
-        if (WIFEXITED(status)) CHECK(is_there(target), "the writer lived, its bundle is not there");
-        if (!is_there(target)) continue;
+        if (WIFEXITED(status)) CHECK(run_is_there(target), "the writer lived, its bundle is not there");
+        if (!run_is_there(target)) continue;
         ok(dar_bundle_open(&b, target, &e), &e);
         ok(dar_bundle_verify(b, &e), &e);
         dar_bundle_close(b);
@@ -562,7 +505,7 @@ static void killed(void **state)
     CHECK(died >= 3 && done > 0, "%d died, %d lived: the delays do not fit this machine", died, done);
     o.overwrite = true;
     ok(write_clip(&made, target, &o, &e), &e);
-    DIR *d = opendir(dir);
+    DIR *d = opendir(scratch_dir);
     for (const struct dirent *x; (x = readdir(d));)
         CHECK(strncmp(x->d_name, "killed.tmp-", 11) != 0, "%s is left", x->d_name);
     closedir(d);
@@ -670,12 +613,12 @@ static void exr(void **state)
     ok(dar_bundle_verify(b, &e), &e);
     dar_bundle_close(b);
     unlink(in_dir("exr/gbuffer.h5"));
-    write_text(in_dir("exr/meta.json"), "{" SIZES ",\"families\":{\"depth\":{\"type\":\"f32\",\"file\":\"exr\"},"
-                                        "\"normal\":{\"type\":\"f32\",\"file\":\"exr\"},"
-                                        "\"mask\":{\"type\":\"u8\",\"file\":\"exr\"},"
-                                        "\"tracking\":{\"type\":\"f32\",\"file\":\"exr\"},"
-                                        "\"part\":{\"type\":\"u32\",\"file\":\"exr\"},"
-                                        "\"world\":{\"type\":\"f32\",\"file\":\"exr\"}}}");
+    scratch_text(in_dir("exr/meta.json"), "{" SIZES ",\"families\":{\"depth\":{\"type\":\"f32\",\"file\":\"exr\"},"
+                                          "\"normal\":{\"type\":\"f32\",\"file\":\"exr\"},"
+                                          "\"mask\":{\"type\":\"u8\",\"file\":\"exr\"},"
+                                          "\"tracking\":{\"type\":\"f32\",\"file\":\"exr\"},"
+                                          "\"part\":{\"type\":\"u32\",\"file\":\"exr\"},"
+                                          "\"world\":{\"type\":\"f32\",\"file\":\"exr\"}}}");
     ok(dar_bundle_open(&b, in_dir("exr"), &e), &e);
     for (size_t t = 0; t < T; t++) {
         const dar_gbuffer *g = &made.d[t].g;
@@ -739,7 +682,7 @@ static void blender(void **state)
 static int set_up(void **state)
 {
     (void)state;
-    if (!mkdtemp(dir)) return -1;
+    if (scratch_make(state)) return -1;
     make_clip(&made);
     return 0;
 }
@@ -747,11 +690,11 @@ static int set_up(void **state)
 static int tear_down(void **state)
 {
     (void)state;
-    remove_tree(dir);
+    run_remove(scratch_dir);
     for (int t = 0; t < T; t++) dar_arena_free(&made.d[t].arena);
     dar_camera_free(&made.cameras);
     dar_scene_free(&made.scene);
-    return is_there(dir);
+    return run_is_there(scratch_dir);
 }
 
 int main(int argc, char **argv)

@@ -1,24 +1,15 @@
 /* test_exr.c: OpenEXR files: planes come back, names are found, what cannot be read is refused in one line. */
-#include "tests/test.h"
-
-#include <sys/stat.h>
-#include <unistd.h>
+#include "tests/scratch.h"
 
 #include "data/exr.h"
-#include "lib/file.h"
 
 #define W 37
 #define H 19
 
-static char path[] = "/tmp/dar-exr-XXXXXX";
+static char path[512];
 static float f32[2][H * W];
 static uint16_t f16[H * W];
 static uint32_t u32[H * W];
-
-static void ok(dar_status s, const dar_err *e)
-{
-    CHECK(s == DAR_OK, "refused: %s", e->text);
-}
 
 /* Blender's names, in an order that is not the file's. */
 static const dar_exr_plane planes[] = {
@@ -180,15 +171,9 @@ static void cut(void **state)
 
 static int set_up(void **state)
 {
-    (void)state;
-    int fd = mkstemp(path);
-    return fd < 0 ? -1 : close(fd);
-}
-
-static int tear_down(void **state)
-{
-    (void)state;
-    return unlink(path);
+    if (scratch_make(state)) return -1;
+    snprintf(path, sizeof path, "%s", in_dir("a.exr"));
+    return 0;
 }
 
 int main(void)
@@ -196,5 +181,5 @@ int main(void)
     const struct CMUnitTest tests[] = { cmocka_unit_test(round_trip), cmocka_unit_test(names),
                                         cmocka_unit_test(windows),    cmocka_unit_test(parts),
                                         cmocka_unit_test(refusals),   cmocka_unit_test(cut) };
-    return cmocka_run_group_tests(tests, set_up, tear_down) != 0;
+    return cmocka_run_group_tests(tests, set_up, scratch_remove) != 0;
 }

@@ -1,5 +1,5 @@
 /* test_h5.c: HDF5 files: what is written comes back, what does not fit is refused in one line. */
-#include "tests/test.h"
+#include "tests/scratch.h"
 
 #include <sys/stat.h>
 #include <unistd.h>
@@ -24,28 +24,11 @@ const char *__asan_default_options(void)
     return "fast_unwind_on_malloc=0";
 }
 
-static char dir[] = "/tmp/dar-h5-XXXXXX";
-
-static const char *in_dir(const char *name)
-{
-    static char path[2][256];
-    static int which;
-    which = !which;
-    snprintf(path[which], sizeof path[which], "%s/%s", dir, name);
-    return path[which];
-}
-
-static void ok(dar_status s, const dar_err *e)
-{
-    CHECK(s == DAR_OK, "refused: %s", e->text);
-}
-
 /* Refused, and the line names the file and says this. */
-static void refused(dar_status found, const dar_err *e, const char *says)
+static void refused_there(dar_status found, const dar_err *e, const char *says)
 {
-    CHECK(found != DAR_OK, "accepted, expected: %s", says);
-    CHECK(strstr(e->text, says), "message: %s; expected: %s", e->text, says);
-    CHECK(strstr(e->text, dir), "message names no file: %s", e->text);
+    refused(found, e, says);
+    CHECK(strstr(e->text, scratch_dir), "message names no file: %s", e->text);
 }
 
 #define FRAMES 5
@@ -200,11 +183,11 @@ static void attributes(void **state)
     ok(dar_h5_get_numbers(f, "x", "one", back, 1, &e), &e);
     ok(dar_h5_get_text(f, "x", "space", text, sizeof text, &e), &e);
     CHECK(strcmp(text, "world") == 0, "found %s", text);
-    refused(dar_h5_get_text(f, "x", "space", small, sizeof small, &e), &e, "at most 4");
-    refused(dar_h5_get_text(f, "x", "scale", text, sizeof text, &e), &e, "attribute scale");
-    refused(dar_h5_get_numbers(f, "x", "space", back, 3, &e), &e, "attribute space");
-    refused(dar_h5_get_numbers(f, "x", "scale", back, 2, &e), &e, "expected 2 numbers");
-    refused(dar_h5_get_numbers(f, "x", "none", back, 1, &e), &e, "missing");
+    refused_there(dar_h5_get_text(f, "x", "space", small, sizeof small, &e), &e, "at most 4");
+    refused_there(dar_h5_get_text(f, "x", "scale", text, sizeof text, &e), &e, "attribute scale");
+    refused_there(dar_h5_get_numbers(f, "x", "space", back, 3, &e), &e, "attribute space");
+    refused_there(dar_h5_get_numbers(f, "x", "scale", back, 2, &e), &e, "expected 2 numbers");
+    refused_there(dar_h5_get_numbers(f, "x", "none", back, 1, &e), &e, "missing");
     dar_h5_close(f);
 }
 
@@ -225,15 +208,15 @@ static void does_not_fit(void **state)
     dar_h5 *f;
     ok(dar_h5_create(&f, in_dir("fit.h5"), &e), &e);
     ok(dar_h5_make(f, "x", &a, &e), &e);
-    refused(dar_h5_make(f, "x", &a, &e), &e, "x: cannot make: HDF5: ");
+    refused_there(dar_h5_make(f, "x", &a, &e), &e, "x: cannot make: HDF5: ");
     ok(dar_h5_commit(f, &e), &e);
     dar_h5_close(f);
     ok(dar_h5_open(&f, in_dir("fit.h5"), &e), &e);
     for (size_t i = 0; i < DAR_COUNT(row); i++) {
         dar_h5_array want = row[i].a;
-        refused(dar_h5_expect(f, "x", &want, &e), &e, row[i].says);
+        refused_there(dar_h5_expect(f, "x", &want, &e), &e, row[i].says);
     }
-    refused(dar_h5_expect(f, "y/z", &a, &e), &e, "y/z: found nothing");
+    refused_there(dar_h5_expect(f, "y/z", &a, &e), &e, "y/z: found nothing");
     dar_h5_close(f);
 }
 
@@ -248,9 +231,9 @@ static void never_half(void **state)
     ok(dar_h5_make(f, "x", &a, &e), &e);
     dar_h5_close(f);
     CHECK(stat(in_dir("half.h5"), &st) != 0, "a file that was not committed is there");
-    refused(dar_h5_open(&f, in_dir("half.h5"), &e), &e, "No such file");
+    refused_there(dar_h5_open(&f, in_dir("half.h5"), &e), &e, "No such file");
     CHECK(!f, "failed, yet open");
-    refused(dar_h5_create(&f, in_dir("none/half.h5"), &e), &e, "No such file");
+    refused_there(dar_h5_create(&f, in_dir("none/half.h5"), &e), &e, "No such file");
 }
 
 /* Written plainly: flushing thousands of files to the disk takes seconds. */
@@ -289,24 +272,10 @@ static void damaged(void **state)
         if (s == DAR_OK) s = dar_h5_expect(f, "x", &b, &e);
         if (s == DAR_OK) s = dar_h5_read(f, "x", &b, 0, 2, y, &e);
         CHECK(!cut || s != DAR_OK, "cut to %zu bytes, yet read", at);
-        if (s != DAR_OK) refused(s, &e, "hurt.h5");
+        if (s != DAR_OK) refused_there(s, &e, "hurt.h5");
         dar_h5_close(f);
     }
     dar_file_map_close(&m);
-}
-
-static int set_up(void **state)
-{
-    (void)state;
-    return mkdtemp(dir) ? 0 : -1;
-}
-
-static int tear_down(void **state)
-{
-    (void)state;
-    static const char *const names[] = { "a.h5", "rows.h5", "attr.h5", "fit.h5", "whole.h5", "hurt.h5" };
-    for (size_t i = 0; i < DAR_COUNT(names); i++) unlink(in_dir(names[i]));
-    return rmdir(dir);
 }
 
 int main(void)
@@ -315,5 +284,5 @@ int main(void)
                                         cmocka_unit_test(foreign),    cmocka_unit_test(own_chunks),
                                         cmocka_unit_test(attributes), cmocka_unit_test(does_not_fit),
                                         cmocka_unit_test(never_half), cmocka_unit_test(damaged) };
-    return cmocka_run_group_tests(tests, set_up, tear_down) != 0;
+    return cmocka_run_group_tests(tests, scratch_make, scratch_remove) != 0;
 }

@@ -1,8 +1,6 @@
 /* test_quality.c: a sound bundle passes every check; one that is damaged in a known way fails the check for that, and
  * no other that the damage does not reach. */
-#include "tests/made.h"
-
-#include <unistd.h>
+#include "tests/scratch.h"
 
 #include "data/h5.h"
 #include "data/png.h"
@@ -11,12 +9,13 @@
 #include "data/rigid.h"
 #include "data/tracks.h"
 #include "lib/json.h"
+#include "tests/made.h"
 
 enum { W = 96, H = 64, T = 9, P = W * H, N = 120, OBJECTS = 3 };
 
 #define BIT(name) (1u << DAR_QUALITY_##name)
 
-static char dir[] = "/tmp/dar-quality-XXXXXX", bundle[64];
+static char bundle[64];
 
 /* ---------------------------------------------------------------- a clip in memory */
 
@@ -114,11 +113,6 @@ static void copy_clip(clip *to, const clip *from)
     memcpy(to, from, sizeof *to);
     to->cameras = paths[1];
     memcpy(to->cameras.view, from->cameras.view, T * sizeof *to->cameras.view);
-}
-
-static void ok(dar_status s, const dar_err *e)
-{
-    CHECK(s == DAR_OK, "%s", e->text);
 }
 
 static void write_clip(clip *x)
@@ -508,9 +502,8 @@ static void told(void **state)
 
 static int set_up(void **state)
 {
-    (void)state;
-    if (!mkdtemp(dir)) return -1;
-    snprintf(bundle, sizeof bundle, "%s/b", dir);
+    if (scratch_make(state)) return -1;
+    snprintf(bundle, sizeof bundle, "%s/b", scratch_dir);
     sound = calloc(1, sizeof *sound);
     hurt = calloc(1, sizeof *hurt);
     if (!sound || !hurt) return -1;
@@ -520,19 +513,11 @@ static int set_up(void **state)
 
 static int tear_down(void **state)
 {
-    (void)state;
-    static const char *const files[] = { "meta.json",   "cameras.json", "gbuffer.h5",      "rgb.h5", "reference.png",
-                                         "cameras.txt", "video.mp4",    "transforms.json", "" };
-    for (size_t i = 0; i < DAR_COUNT(files); i++) {
-        char path[96];
-        snprintf(path, sizeof path, "%s/%s", bundle, files[i]);
-        remove(path);
-    }
     dar_camera_free(&paths[0]);
     dar_camera_free(&paths[1]);
     free(sound);
     free(hurt);
-    return rmdir(dir);
+    return scratch_remove(state);
 }
 
 int main(void)

@@ -1,36 +1,18 @@
 /* test_safetensors.c: what is written is read; every kind of damage gives one line that names the file. */
-#include "tests/test.h"
+#include "tests/scratch.h"
 
 #include <dirent.h>
 #include <signal.h>
 #include <sys/resource.h>
-#include <sys/stat.h>
-#include <unistd.h>
 
-#include "lib/file.h"
 #include "lib/safetensors_write.h"
 #include "lib/weights.h"
 
-static char dir[64];
-
-static int make_dir(void **state)
+static size_t files_there(void)
 {
-    (void)state;
-    snprintf(dir, sizeof dir, "build/safetensors-XXXXXX");
-    return mkdtemp(dir) ? 0 : -1;
-}
-
-static size_t files_in(const char *path, bool remove_them)
-{
-    char full[512];
     size_t n = 0;
-    DIR *d = opendir(path);
-    for (const struct dirent *x; (x = readdir(d));)
-        if (x->d_name[0] != '.') {
-            n++;
-            snprintf(full, sizeof full, "%s/%s", path, x->d_name);
-            if (remove_them) unlink(full);
-        }
+    DIR *d = opendir(scratch_dir);
+    for (const struct dirent *x; (x = readdir(d));) n += x->d_name[0] != '.';
     closedir(d);
     return n;
 }
@@ -38,22 +20,7 @@ static size_t files_in(const char *path, bool remove_them)
 static int empty_dir(void **state)
 {
     (void)state;
-    files_in(dir, true);
-    return 0;
-}
-
-static int remove_dir(void **state)
-{
-    return empty_dir(state) || rmdir(dir);
-}
-
-static const char *in_dir(const char *name)
-{
-    static char path[4][128];
-    static int turn;
-    char *p = path[turn++ % 4];
-    snprintf(p, sizeof path[0], "%s/%s", dir, name);
-    return p;
+    return run_remove(scratch_dir) || mkdir(scratch_dir, 0777);
 }
 
 static void same_text(const char *found, const char *expected)
@@ -394,8 +361,8 @@ static void written_is_read(void **state)
               DAR_OK,
           "%s", e.text);
     check_items(in_dir("m.safetensors"));
-    check_items(dir);
-    assert_int_equal(files_in(dir, false), 1);
+    check_items(scratch_dir);
+    assert_int_equal(files_there(), 1);
     assert_int_equal(dar_weights_open(&s, in_dir("m.safetensors"), &e), DAR_OK);
     assert_string_equal(dar_weights_meta(s, "ss_network_alpha"), "16 \"\n");
     assert_int_equal((uintptr_t)dar_weights_at(s, 0)->data % 64, 0);
@@ -405,7 +372,7 @@ static void written_is_read(void **state)
     assert_int_equal(dar_weights_open(&s, in_dir("empty.safetensors"), &e), DAR_OK);
     assert_int_equal(dar_weights_count(s), 0);
     dar_weights_close(s);
-    assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_FORMAT); /* two files: which? */
+    assert_int_equal(dar_weights_open(&s, scratch_dir, &e), DAR_ERR_FORMAT); /* two files: which? */
 
     item[1].name = "q";
     CHECK_ABORTS(dar_safetensors_write(in_dir("m.safetensors"), item, n, NULL, &e));
@@ -420,9 +387,9 @@ static void shards(void **state)
     size_t n = items(item);
     assert_int_equal(dar_safetensors_write(in_dir("m.safetensors"), item, n, NULL, &e), DAR_OK);
     CHECK(dar_safetensors_write(in_dir("m.safetensors"), item, n, &o, &e) == DAR_OK, "%s", e.text);
-    assert_int_equal(files_in(dir, false), 5); /* 17, 24, 4, 24 bytes in 4 shards, and the index; no m.safetensors */
+    assert_int_equal(files_there(), 5); /* 17, 24, 4, 24 bytes in 4 shards, and the index; no m.safetensors */
     assert_int_equal(access(in_dir("m-00004-of-00004.safetensors"), F_OK), 0);
-    check_items(dir);
+    check_items(scratch_dir);
     check_items(in_dir("m.safetensors.index.json"));
 
     assert_int_equal(dar_safetensors_write(in_dir("m.safetensors"), item, n, NULL, &e), DAR_OK);
@@ -467,21 +434,21 @@ static void damaged_indices(void **state)
     assert_int_equal(dar_safetensors_write(in_dir("c.safetensors"), &other, 1, NULL, &e), DAR_OK);
     for (size_t i = 0; i < DAR_COUNT(bad); i++) {
         put_text("m.safetensors.index.json", bad[i].map);
-        assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_FORMAT);
+        assert_int_equal(dar_weights_open(&s, scratch_dir, &e), DAR_ERR_FORMAT);
         assert_null(s);
         char expected[512], *mark;
-        snprintf(expected, sizeof expected, "%s/m.safetensors.index.json: %s", dir, bad[i].message);
+        snprintf(expected, sizeof expected, "%s/m.safetensors.index.json: %s", scratch_dir, bad[i].message);
         while ((mark = strstr(expected, "DIR"))) {
-            memmove(mark + strlen(dir), mark + 3, strlen(mark + 3) + 1);
-            memcpy(mark, dir, strlen(dir));
+            memmove(mark + strlen(scratch_dir), mark + 3, strlen(mark + 3) + 1);
+            memcpy(mark, scratch_dir, strlen(scratch_dir));
         }
         same_text(e.text, expected);
     }
     put_text("m.safetensors.index.json", "{\"weight_map\": {\"q\": \"none.safetensors\"}}");
-    assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_IO);
+    assert_int_equal(dar_weights_open(&s, scratch_dir, &e), DAR_ERR_IO);
     assert_int_equal(dar_weights_open(&s, in_dir("none"), &e), DAR_ERR_IO);
-    files_in(dir, true);
-    assert_int_equal(dar_weights_open(&s, dir, &e), DAR_ERR_FORMAT);
+    empty_dir(state);
+    assert_int_equal(dar_weights_open(&s, scratch_dir, &e), DAR_ERR_FORMAT);
 }
 
 /* A disk that fills up in the middle, played by a limit on the size of files: what was there stays. */
@@ -510,7 +477,7 @@ static void full_disk(void **state)
     assert_int_equal(one, DAR_ERR_NOMEM);
     assert_int_equal(cut, DAR_ERR_NOMEM);
     assert_int_equal(dar_status_exit(one), 3);
-    assert_int_equal(files_in(dir, false), 1);
+    assert_int_equal(files_there(), 1);
     check_items(in_dir("m.safetensors"));
     assert_int_equal(dar_safetensors_write(in_dir("no/m.safetensors"), item, n, NULL, &e), DAR_ERR_IO);
     free(big);
@@ -556,5 +523,5 @@ int main(void)
         cmocka_unit_test_setup(full_disk, empty_dir),
         cmocka_unit_test(foreign_file),
     };
-    return cmocka_run_group_tests(tests, make_dir, remove_dir) != 0;
+    return cmocka_run_group_tests(tests, scratch_make, scratch_remove) != 0;
 }

@@ -1,8 +1,5 @@
 /* test_video.c: frames through ffmpeg and back; children that are missing, refuse or are killed. */
-#include "tests/test.h"
-
-#include <sys/stat.h>
-#include <unistd.h>
+#include "tests/scratch.h"
 
 #include "data/video.h"
 
@@ -10,14 +7,8 @@
 #define H      18
 #define FRAMES 7
 
-static char dir[] = "/tmp/dar-video-XXXXXX";
 static char path[64], script[64];
 static uint8_t rgb[FRAMES][H * W * 3], back[H * W * 3];
-
-static void ok(dar_status s, const dar_err *e)
-{
-    CHECK(s == DAR_OK, "refused: %s", e->text);
-}
 
 /* Smooth colours, saturated ones among them; each frame different. */
 static void fill(void)
@@ -149,7 +140,7 @@ static void children(void **state)
     dar_video *v;
     dar_err e;
     snprintf(old, sizeof old, "%s", getenv("PATH") ? getenv("PATH") : "");
-    setenv("PATH", dir, 1);
+    setenv("PATH", scratch_dir, 1);
     for (size_t i = 0; i < DAR_COUNT(row); i++) {
         pretend(row[i].script);
         dar_status s = dar_video_create(&v, path, W, H, 25, DAR_VIDEO_FFV1, &e);
@@ -164,23 +155,15 @@ static void children(void **state)
 
 static int set_up(void **state)
 {
-    (void)state;
-    if (!mkdtemp(dir)) return -1;
-    snprintf(path, sizeof path, "%s/-v:a %%d", dir); /* no option, no protocol, no pattern */
-    snprintf(script, sizeof script, "%s/ffmpeg", dir);
+    if (scratch_make(state)) return -1;
+    snprintf(path, sizeof path, "%s/-v:a %%d", scratch_dir); /* no option, no protocol, no pattern */
+    snprintf(script, sizeof script, "%s/ffmpeg", scratch_dir);
     return 0;
-}
-
-static int tear_down(void **state)
-{
-    (void)state;
-    unlink(path);
-    return rmdir(dir);
 }
 
 int main(void)
 {
     const struct CMUnitTest tests[] = { cmocka_unit_test(exact), cmocka_unit_test(lossy), cmocka_unit_test(stop_early),
                                         cmocka_unit_test(refusals), cmocka_unit_test(children) };
-    return cmocka_run_group_tests(tests, set_up, tear_down) != 0;
+    return cmocka_run_group_tests(tests, set_up, scratch_remove) != 0;
 }
