@@ -121,8 +121,29 @@ static void not_finite(void **state)
     net_free(&without);
 }
 
+/* Bad steps are passed over, but not for ever; a good one between them counts from the start. */
+static void too_many(void **state)
+{
+    (void)state;
+    dar_optim_config c = dar_optim_default();
+    dar_err e;
+    net n;
+    c.patience = 2;
+    net_init(&n, DAR_F32, &c);
+    for (int k = 0; k < 6; k++) {
+        gradient(&n, 0);
+        if (k != 2) dar_dtype_set(DAR_F32, n.a->g.data, 5, NAN);
+        dar_optim_report r = dar_optim_step(&n.o);
+        dar_status s = dar_optim_check(&n.o, &r, &e);
+        assert_int_equal(s, k < 5 ? DAR_OK : DAR_ERR_NUMERIC);
+    }
+    CHECK(strstr(e.text, "3 times in a row") && strstr(e.text, " a:"), "%s", e.text);
+    net_free(&n);
+}
+
 int main(void)
 {
-    static const struct CMUnitTest tests[] = { cmocka_unit_test(against_torch), cmocka_unit_test(not_finite) };
+    static const struct CMUnitTest tests[] = { cmocka_unit_test(against_torch), cmocka_unit_test(not_finite),
+                                               cmocka_unit_test(too_many) };
     return cmocka_run_group_tests_name("optim", tests, NULL, NULL) != 0;
 }

@@ -11,9 +11,14 @@
 
 dar_optim_config dar_optim_default(void)
 {
-    return (dar_optim_config){
-        .rate = 1e-4, .beta1 = 0.9, .beta2 = 0.999, .eps = 1e-10, .decay = 0.03, .max_norm = 0.05, .warmup = 200
-    };
+    return (dar_optim_config){ .rate = 1e-4,
+                               .beta1 = 0.9,
+                               .beta2 = 0.999,
+                               .eps = 1e-10,
+                               .decay = 0.03,
+                               .max_norm = 0.05,
+                               .warmup = 200,
+                               .patience = 20 };
 }
 
 void dar_optim_init(dar_optim *o, const dar_optim_config *c, dar_params *p, dar_arena *a)
@@ -82,7 +87,17 @@ dar_optim_report dar_optim_step(dar_optim *o)
                           q->g.data);
         dar_tensor_fill(&q->g, 0);
     }
+    o->in_a_row = r.skipped ? o->in_a_row + 1 : 0;
     if (r.skipped) o->skipped++;
     else o->steps++;
     return r;
+}
+
+dar_status dar_optim_check(const dar_optim *o, const dar_optim_report *r, dar_err *e)
+{
+    if (o->in_a_row <= o->config.patience) return DAR_OK;
+    return dar_fail(e, DAR_ERR_NUMERIC,
+                    "step %lld: gradients were not finite %lld times in a row, the last time that of %s: found norm %g",
+                    (long long)o->steps, (long long)o->in_a_row, r->nonfinite ? r->nonfinite : "no single parameter",
+                    r->norm);
 }

@@ -10,8 +10,12 @@
  * moments, as in the public scripts.  The gradient is scaled by min(1, max_norm / (norm + 1e-6)).  A step whose
  * gradient is not finite is skipped: weights, moments and k stay, its gradients are thrown away.
  *
- * Weights are those of the table (f32, or f64 in an f64 network), moments likewise; sums are f64 in a fixed order: same
- * bits for any thread count.  Source: Loshchilov and Hutter 2019, algorithm 2; Pascanu et al. 2013, algorithm 1. */
+ * Weights are those of the table (f32, or f64 in an f64 network), moments likewise or, to halve their memory, bf16;
+ * sums are f64 in a fixed order: same bits for any thread count.  Moments in bf16 are rounded up or down at random,
+ * with the odds that make the mean right, as a pure function of seed, step and place: rounded to the nearest, v would
+ * stand still at beta2 0.999, where it changes by less than half of its last digit.
+ *
+ * Source: Loshchilov and Hutter 2019, algorithm 2; Pascanu et al. 2013, algorithm 1. */
 #ifndef DAR_TRAIN_OPTIM_H
 #define DAR_TRAIN_OPTIM_H
 
@@ -21,10 +25,13 @@ typedef struct dar_optim_config {
     double rate, beta1, beta2, eps, decay;
     double max_norm; /* 0: no clipping */
     int64_t warmup;  /* steps */
+    bool bf16_moments;
+    uint64_t seed;    /* of their rounding */
+    int64_t patience; /* steps in a row that may be skipped */
 } dar_optim_config;
 
 /* The paper's rate 1e-4 after 200 steps; what it leaves open as in the scripts of the backbone: betas 0.9 and 0.999,
- * eps 1e-10, decay 0.03, norm 0.05. */
+ * eps 1e-10, decay 0.03, norm 0.05; patience 20. */
 dar_optim_config dar_optim_default(void);
 
 typedef struct dar_optim {
@@ -33,6 +40,7 @@ typedef struct dar_optim {
     dar_tensor *m, *v; /* [params.count]; data NULL where nothing is trained */
     int64_t steps;     /* done: k of the next */
     int64_t skipped;   /* not finite */
+    int64_t in_a_row;  /* of them, the last ones */
 } dar_optim;
 
 /* Moments are pushed on `a`, zeroed; the parameters have values and gradients already. */
@@ -46,6 +54,10 @@ typedef struct dar_optim_report {
 } dar_optim_report;
 
 dar_optim_report dar_optim_step(dar_optim *o);
+
+/* After a step: DAR_ERR_NUMERIC, with the name of a parameter, if more than the configured patience were skipped in a
+ * row. */
+dar_status dar_optim_check(const dar_optim *o, const dar_optim_report *r, dar_err *e);
 
 /* Euclidean norm of all gradients. */
 double dar_optim_norm(const dar_params *p);
