@@ -46,6 +46,8 @@ static const dar_option options[] = {
       .help = "transformer with adapter: safetensors, an index of shards, or a directory of one" },
     { .name = "vae", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_VAE],
       .help = "autoencoder: safetensors or .pth" },
+    { .name = "adapter", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_ADAPTER],
+      .help = "control adapter, instead of the transformer's own" },
     { .name = "lora", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_LORA],
       .help = "low-rank additions" },
     { .name = "lora-strength", .placeholder = "S", .type = DAR_ARG_NUMBER, .target = &o.strength, .standard = "1",
@@ -90,6 +92,7 @@ static const dar_option options[] = {
 struct job {
     dar_run *r;
     dar_model *m;
+    dar_condition condition;
     dar_pipeline_options how;
     char **bundle, **reference; /* names; end with NULL */
     size_t done, kept;
@@ -130,14 +133,31 @@ static dar_status read_options(struct job *j, dar_err *e)
     return read_skips(&p->sampler.skip, e);
 }
 
+/* Channels: those of --channels, else of the model; if it says none, camera where the adapter takes no geometry. */
+static dar_status read_condition(struct job *j, const dar_model_file *f, dar_err *e)
+{
+    dar_json condition = dar_json_object(dar_json_root(f->doc), "condition");
+    bool said = dar_json_get(condition, "channels").item != NULL;
+    dar_condition_read(&j->condition, condition);
+    DAR_TRY(dar_json_finish(f->doc, e));
+    const char *channels = o.channels || said || f->c.adapter.geometry ? o.channels : "camera";
+    if (channels) DAR_TRY(dar_channel_set_parse(&j->condition.set, channels, e));
+    dar_model_feed feed = { DAR_RAYS_GROUP, DAR_RAYS_CHANNELS, (int64_t)j->condition.set.channels };
+    return dar_model_file_check(f, &feed, e);
+}
+
 static dar_status open_model(struct job *j, dar_err *e)
 {
-    dar_model_options m = { .model = o.model, .weights = o.weights, .channels = o.channels, .strength = o.strength };
+    dar_model_options m = { .weights = o.weights, .strength = o.strength, .plan = o.common.dry_run };
+    dar_model_file f;
     memcpy(m.part, o.part, sizeof m.part);
     m.storage = (dar_dtype)o.precision;
     m.apart = !(j->how.sampler.skip >> DAR_SKIP_LORA & 1);
-    m.plan = o.common.dry_run;
-    return dar_model_open(&j->m, &m, e);
+    dar_status s = dar_model_file_open(&f, o.model, e);
+    if (s == DAR_OK) s = read_condition(j, &f, e);
+    if (s == DAR_OK) s = dar_model_open(&j->m, &f, &m, e);
+    dar_model_file_close(&f);
+    return s;
 }
 
 /* ---------------------------------------------------------------- names */
@@ -235,18 +255,17 @@ static void print_sampler(dar_json_writer *w, const struct job *j)
     dar_json_write_end(w);
 }
 
-static void print_model(dar_json_writer *w, const dar_model *m)
+static void print_model(dar_json_writer *w, const dar_model *m, const dar_condition *c)
 {
     char set[128] = "camera";
-    for (size_t i = 0, n = 0; i < m->condition.set.families; i++)
-        n += (size_t)snprintf(set + n, sizeof set - n, "%s%s", i ? "+" : "",
-                              dar_family_table[m->condition.set.family[i]].name);
+    for (size_t i = 0, n = 0; i < c->set.families; i++)
+        n += (size_t)snprintf(set + n, sizeof set - n, "%s%s", i ? "+" : "", dar_family_table[c->set.family[i]].name);
     dar_json_write_text(w, "model", m->c.name);
     for (int i = 0; i < DAR_MODEL_PARTS; i++)
         if (*m->path[i]) print_file(w, dar_model_part_name[i], m->path[i]);
     if (*m->path[DAR_MODEL_LORA]) dar_json_write_number(w, "lora_strength", o.strength);
     dar_json_write_text(w, "channels", set);
-    dar_json_write_text(w, "geometry_frame", m->condition.geometry == DAR_GEOMETRY_SCENE ? "scene" : "camera0");
+    dar_json_write_text(w, "geometry_frame", c->geometry == DAR_GEOMETRY_SCENE ? "scene" : "camera0");
 }
 
 /* Everything that the video depends on, and nothing else. */
@@ -260,7 +279,7 @@ static dar_status print_settings(dar_json_writer *w, const struct job *j, const 
     DAR_TRY(print_hashed(w, "bundle", path, dar_bundle_path(b, "meta.json", meta), e));
     DAR_TRY(print_hashed(w, "reference", reference, reference, e));
     DAR_TRY(print_hashed(w, "model_file", j->m->file, j->m->file, e));
-    print_model(w, j->m);
+    print_model(w, j->m, &j->condition);
     DAR_TRY(print_hashed(w, "text", o.text, o.text, e));
     DAR_TRY(print_hashed(w, "negative", o.negative, o.negative, e));
     DAR_TRY(print_hashed(w, "noise_file", j->how.noise_file, j->how.noise_file, e));
@@ -334,7 +353,7 @@ static dar_status render(struct job *j, dar_pipeline *p, const char *path, const
     struct hearing h = { .path = path, .begun = dar_log_clock() };
     const dar_pipeline_listener listener = { hear_frame, hear_stage, &h };
     h.progress = dar_progress_begin(path, "steps", (double)o.steps);
-    DAR_TRY(dar_output_create(&h.output, path, p->b, &j->m->condition, &p->cond, rgb, &files, e));
+    DAR_TRY(dar_output_create(&h.output, path, p->b, &j->condition, &p->cond, rgb, &files, e));
     dar_status s = dar_pipeline_render(p, rgb, &listener, e);
     dar_progress_end(&h.progress);
     if (s == DAR_OK) s = dar_output_commit(h.output, settings, e);
@@ -363,7 +382,7 @@ static dar_status make_video(struct job *j, int bundle, dar_bundle *b, size_t i,
         return dar_fail(e, DAR_ERR_USAGE, "%s: found something made otherwise, expected --overwrite or another -o",
                         path);
     dar_status s = load_reference(b, reference, in, &rgb, e);
-    if (s == DAR_OK && !*p) s = dar_pipeline_open(p, j->m, in, b, &j->how, e);
+    if (s == DAR_OK && !*p) s = dar_pipeline_open(p, j->m, &j->condition, in, b, &j->how, e);
     if (s == DAR_OK) s = render(j, *p, path, rgb, settings, e);
     free(rgb);
     if (s == DAR_OK) j->done++;
@@ -428,8 +447,8 @@ static dar_status sample_bundle(struct job *j, int bundle, dar_err *e)
     dar_bundle *b;
     DAR_TRY(dar_bundle_open(&b, path, e));
     dar_json_write_text(&j->r->json, "bundle", path);
-    dar_status s =
-        o.common.dry_run ? dar_pipeline_open(&p, j->m, path, b, &j->how, e) : make_videos(j, bundle, b, &p, e);
+    dar_status s = o.common.dry_run ? dar_pipeline_open(&p, j->m, &j->condition, path, b, &j->how, e)
+                                    : make_videos(j, bundle, b, &p, e);
     if (p) tell_plan(j, p, path);
     dar_pipeline_close(p);
     dar_bundle_close(b);

@@ -11,7 +11,7 @@
 #define DAR_INFER_OUTPUT_H
 
 #include "data/bundle.h"
-#include "infer/model.h"
+#include "models/model.h"
 
 typedef struct dar_output_options {
     bool png, mp4, mkv, sheet;

@@ -99,14 +99,14 @@ static dar_status measure(dar_pipeline *p, dar_condition_source *source, dar_err
 {
     const dar_bundle_meta *meta = &p->b->meta;
     const char *path = p->path;
-    const int64_t token = dar_model_token(p->m), shrink = dar_vae_shrink(&p->m->c.vae);
+    const int64_t token = dar_model_token(&p->m->c), shrink = dar_vae_shrink(&p->m->c.vae);
     if (meta->width % token || meta->height % token)
         return dar_fail(e, DAR_ERR_USAGE,
                         "%s: found %d x %d pixels, expected multiples of %lld, the width of a token: "
                         "render the bundle with --size %lldx%lld",
                         path, meta->width, meta->height, (long long)token, (long long)whole_tokens(meta->width, token),
                         (long long)whole_tokens(meta->height, token));
-    DAR_TRY(dar_bundle_source(p->b, &p->m->condition, source, e));
+    DAR_TRY(dar_bundle_source(p->b, p->condition, source, e));
     p->frames = (int64_t)dar_rays_latent_frames(meta->frames);
     p->height = meta->height / shrink;
     p->width = meta->width / shrink;
@@ -123,7 +123,7 @@ static bool plans(const dar_pipeline *p)
 
 static dar_status prepare(dar_pipeline *p, const dar_condition_source *source, const dar_sampler_config *c, dar_err *e)
 {
-    const dar_condition *condition = &p->m->condition;
+    const dar_condition *condition = p->condition;
     DAR_TRY(dar_tape_init(&p->tape, &p->step, e));
     p->tape.recording = false;
     p->cond = (dar_tensor){ 0 };
@@ -330,13 +330,14 @@ static dar_status open_clip(dar_pipeline *p, dar_err *e)
     return prepare(p, &source, &p->o.sampler, e);
 }
 
-dar_status dar_pipeline_open(dar_pipeline **out, const dar_model *m, const char *path, dar_bundle *b,
-                             const dar_pipeline_options *o, dar_err *e)
+dar_status dar_pipeline_open(dar_pipeline **out, const dar_model *m, const dar_condition *c, const char *path,
+                             dar_bundle *b, const dar_pipeline_options *o, dar_err *e)
 {
     dar_pipeline *p = calloc(1, sizeof *p);
     *out = NULL;
     if (!p) return dar_fail(e, DAR_ERR_NOMEM, "sampling: out of memory");
     p->m = m;
+    p->condition = c;
     p->path = path;
     p->b = b;
     p->o = *o;

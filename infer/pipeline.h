@@ -9,7 +9,7 @@
 #define DAR_INFER_PIPELINE_H
 
 #include "data/bundle.h"
-#include "infer/model.h"
+#include "models/model.h"
 #include "models/sampler.h"
 
 typedef struct dar_pipeline_options {
@@ -25,6 +25,7 @@ typedef struct dar_pipeline_options {
 
 typedef struct dar_pipeline {
     const dar_model *m;
+    const dar_condition *condition;
     const char *path;
     dar_bundle *b;
     dar_pipeline_options o;
@@ -44,10 +45,10 @@ typedef struct dar_pipeline {
     dar_tensor words[2], given;
 } dar_pipeline;
 
-/* Plan, and unless the model only plans, reserve memory, read the condition, prepare the clip.  m, b and `path`, which
- * stands for b in messages, must outlive it.  On failure *out is NULL. */
-dar_status dar_pipeline_open(dar_pipeline **out, const dar_model *m, const char *path, dar_bundle *b,
-                             const dar_pipeline_options *o, dar_err *e);
+/* Plan, and unless the model only plans, reserve memory, read the condition, prepare the clip.  m, c, b and `path`,
+ * which stands for b in messages, must outlive it.  On failure *out is NULL. */
+dar_status dar_pipeline_open(dar_pipeline **out, const dar_model *m, const dar_condition *c, const char *path,
+                             dar_bundle *b, const dar_pipeline_options *o, dar_err *e);
 void dar_pipeline_close(dar_pipeline *p); /* accepts NULL */
 
 typedef enum dar_pipeline_stage { DAR_PIPELINE_ENCODE, DAR_PIPELINE_SAMPLE, DAR_PIPELINE_DECODE } dar_pipeline_stage;

@@ -138,24 +138,25 @@ typedef struct loading {
     const char *file;
     rename_fn *rename;
     const dar_adapter *adapter; /* NULL: there is none */
+    unsigned roles;             /* what is wanted */
     uint64_t seed;
     size_t missing, wrong;
     dar_err first[2]; /* of each, in words */
 } loading;
 
-static bool wanted(const dar_param *q)
+static bool wanted(const loading *l, const dar_param *q)
 {
-    return !(q->info.role & DAR_PARAM_LORA);
+    return q->info.role & l->roles && !q->x.data;
 }
 
-static size_t hits(const dar_params *p, const dar_weights *w, rename_fn *rename)
+static size_t hits(const loading *l, rename_fn *rename)
 {
     char name[NAME_SIZE];
     size_t n = 0;
-    for (size_t i = 0; i < p->count; i++) {
-        if (!wanted(p->at[i])) continue;
-        rename(p->at[i]->name, name, sizeof name);
-        n += dar_weights_find(w, name) != NULL;
+    for (size_t i = 0; i < l->p->count; i++) {
+        if (!wanted(l, l->p->at[i])) continue;
+        rename(l->p->at[i]->name, name, sizeof name);
+        n += dar_weights_find(l->w, name) != NULL;
     }
     return n;
 }
@@ -225,7 +226,7 @@ static dar_status load(loading *l, rename_fn *const *renames, size_t n, dar_err 
     if (!dar_weights_count(l->w)) return dar_fail(e, DAR_ERR_FORMAT, "a file of weights without a tensor");
     l->file = dar_weights_at(l->w, 0)->file;
     for (size_t i = 0; i < n; i++) {
-        size_t k = hits(l->p, l->w, renames[i]);
+        size_t k = hits(l, renames[i]);
         if (k > most || !i) {
             most = k;
             l->rename = renames[i];
@@ -234,7 +235,7 @@ static dar_status load(loading *l, rename_fn *const *renames, size_t n, dar_err 
     if (!most)
         return dar_fail(e, DAR_ERR_FORMAT, "%s: none of its tensors is of this network: found %s, expected %s", l->file,
                         dar_weights_at(l->w, 0)->name, l->p->at[0]->name);
-    if (l->adapter && l->adapter->w) {
+    if (l->adapter && l->adapter->w && !l->adapter->w->x.data) {
         char name[NAME_SIZE];
         l->rename(l->adapter->w->name, name, sizeof name);
         if (!dar_weights_find(l->w, name))
@@ -242,7 +243,7 @@ static dar_status load(loading *l, rename_fn *const *renames, size_t n, dar_err 
                             l->file, name);
     }
     for (size_t i = 0; i < l->p->count; i++)
-        if (wanted(l->p->at[i])) load_one(l, l->p->at[i]);
+        if (wanted(l, l->p->at[i])) load_one(l, l->p->at[i]);
     tell_unused(l);
     if (!l->missing && !l->wrong) return DAR_OK;
     return dar_fail(e, DAR_ERR_FORMAT, "%s: %zu tensors missing, %zu of another shape or type: %s", l->file, l->missing,
@@ -253,12 +254,20 @@ dar_status dar_load_dit(dar_dit *m, dar_params *p, dar_weights *w, uint64_t seed
 {
     static rename_fn *const renames[] = { as_it_is, below_model, below_diffusion_model, dar_load_diffusers_dit };
     loading l = { .p = p, .w = w, .adapter = &m->adapter, .seed = seed };
+    l.roles = DAR_PARAM_BASE | DAR_PARAM_ADAPTER;
+    return load(&l, renames, DAR_COUNT(renames), e);
+}
+
+dar_status dar_load_adapter(dar_dit *m, dar_params *p, dar_weights *w, uint64_t seed, dar_err *e)
+{
+    static rename_fn *const renames[] = { as_it_is, below_model, below_diffusion_model };
+    loading l = { .p = p, .w = w, .adapter = &m->adapter, .seed = seed, .roles = DAR_PARAM_ADAPTER };
     return load(&l, renames, DAR_COUNT(renames), e);
 }
 
 dar_status dar_load_vae(dar_params *p, dar_weights *w, dar_err *e)
 {
     static rename_fn *const renames[] = { as_it_is, below_model, dar_load_diffusers_vae };
-    loading l = { .p = p, .w = w };
+    loading l = { .p = p, .w = w, .roles = DAR_PARAM_ALL };
     return load(&l, renames, DAR_COUNT(renames), e);
 }

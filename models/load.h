@@ -13,11 +13,14 @@
 #include "lib/weights.h"
 #include "models/dit.h"
 
-/* Base and adapter; low-rank additions have files of their own (models/lora.h).
+/* Base and adapter, but what has a value already; low-rank additions have files of their own (models/lora.h).
  *
  * A file without adapter is refused if the network has one: rays would mean nothing to it.  Fewer input channels than
  * the network's are widened (dar_adapter_bind); residual blocks beyond the file's are made anew, as identity. */
 dar_status dar_load_dit(dar_dit *m, dar_params *p, dar_weights *w, uint64_t seed, dar_err *e);
+
+/* The adapter alone, from a file of its own, before the rest is loaded; widened likewise. */
+dar_status dar_load_adapter(dar_dit *m, dar_params *p, dar_weights *w, uint64_t seed, dar_err *e);
 
 /* Into a table that dar_vae_init, or dar_taew_init, filled and nobody else. */
 dar_status dar_load_vae(dar_params *p, dar_weights *w, dar_err *e);

@@ -10,7 +10,7 @@
  *   text      keys and values of a prompt once, not in every call
  *   times     one embedding of time for the first frame and one for the rest, not one per frame
  *   padding   the zeros after a prompt are one weighted key
- *   lora      low-rank additions are added to the weights once (infer/model.h)
+ *   lora      low-rank additions are added to the weights once (models/model.h)
  *   repeat    pieces of the known video that must encode to the same are not encoded (infer/pipeline.h)
  *
  * One clip at a time; the same bits for any number of threads.  Source: the paper, section 4.3; Ho and Salimans 2022,
