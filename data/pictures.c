@@ -12,6 +12,7 @@
 
 #include "data/image.h"
 #include "data/objseq.h"
+#include "data/resize.h"
 #include "data/video.h"
 #include "lib/file.h"
 
@@ -31,27 +32,45 @@ static dar_status check_size(const char *path, size_t w, size_t h, size_t width,
     return dar_fail(e, DAR_ERR_FORMAT, "%s: found %zu x %zu pixels, expected %zu x %zu", path, w, h, width, height);
 }
 
-static dar_status decode(const char *path, const dar_file_map *m, size_t width, size_t height, uint8_t *rgb, dar_err *e)
+/* The picture as RGB in memory of its own, of its own size. */
+static dar_status decode(const char *path, const dar_file_map *m, dar_image *im, uint8_t **rgb, dar_err *e)
 {
-    dar_image im;
-    DAR_TRY(dar_image_probe(&im, path, m->data, m->size, e));
-    DAR_TRY(check_size(path, im.width, im.height, width, height, e));
-    if (!(im.rgba = malloc(4 * width * height))) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
-    dar_status s = dar_image_decode(&im, path, m->data, m->size, e);
-    for (size_t i = 0; s == DAR_OK && i < width * height; i++)
+    size_t pixels = im->width * im->height;
+    im->rgba = malloc(4 * pixels);
+    if (!im->rgba) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
+    dar_status s = dar_image_decode(im, path, m->data, m->size, e);
+    if (s == DAR_OK && !(*rgb = malloc(3 * pixels))) s = dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
+    for (size_t i = 0; s == DAR_OK && i < pixels; i++)
         for (size_t c = 0; c < 3; c++)
-            rgb[3 * i + c] = (uint8_t)((im.rgba[4 * i + c] * im.rgba[4 * i + 3] + 127) / 255);
-    free(im.rgba);
+            (*rgb)[3 * i + c] = (uint8_t)((im->rgba[4 * i + c] * im->rgba[4 * i + 3] + 127) / 255);
+    free(im->rgba);
+    return s;
+}
+
+static dar_status load(const char *path, size_t width, size_t height, bool any, uint8_t *rgb, dar_err *e)
+{
+    dar_file_map m;
+    dar_image im;
+    uint8_t *own = NULL;
+    DAR_TRY(dar_file_map_open(&m, path, e));
+    dar_status s = dar_image_probe(&im, path, m.data, m.size, e);
+    if (s == DAR_OK && !any) s = check_size(path, im.width, im.height, width, height, e);
+    if (s == DAR_OK) s = decode(path, &m, &im, &own, e);
+    if (s == DAR_OK && im.width == width && im.height == height) memcpy(rgb, own, 3 * width * height);
+    else if (s == DAR_OK) s = dar_resize(path, own, im.width, im.height, rgb, width, height, e);
+    free(own);
+    dar_file_map_close(&m);
     return s;
 }
 
 dar_status dar_pictures_load(const char *path, size_t width, size_t height, uint8_t *rgb, dar_err *e)
 {
-    dar_file_map m;
-    DAR_TRY(dar_file_map_open(&m, path, e));
-    dar_status s = decode(path, &m, width, height, rgb, e);
-    dar_file_map_close(&m);
-    return s;
+    return load(path, width, height, false, rgb, e);
+}
+
+dar_status dar_pictures_fit(const char *path, size_t width, size_t height, uint8_t *rgb, dar_err *e)
+{
+    return load(path, width, height, true, rgb, e);
 }
 
 /* ---------------------------------------------------------------- many */

@@ -24,4 +24,7 @@ dar_status dar_pictures_read(dar_pictures *p, uint8_t *rgb, dar_err *e);
 /* A single file, which must be of this size. */
 dar_status dar_pictures_load(const char *path, size_t width, size_t height, uint8_t *rgb, dar_err *e);
 
+/* A single file of any size, brought to this one (data/resize.h). */
+dar_status dar_pictures_fit(const char *path, size_t width, size_t height, uint8_t *rgb, dar_err *e);
+
 #endif

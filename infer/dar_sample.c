@@ -32,8 +32,9 @@ static const char *const grid_names[] = { "even", "twice", "whole", "diffusers",
 static const dar_option options[] = {
     { .name = "out", .letter = 'o', .placeholder = "DIR", .type = DAR_ARG_TEXT, .target = &o.out,
       .help = "directory of the video; of several videos, directories in it by the names of bundle and picture" },
-    { .name = "reference", .placeholder = "IMG", .type = DAR_ARG_LIST, .target = &o.references,
-      .help = "picture of the first frame, PNG or JPEG, instead of the bundle's; several: a video for each" },
+    { .name = "reference", .placeholder = "IMG...", .type = DAR_ARG_WORDS, .target = &o.references,
+      .help = "pictures of the first frame, PNG or JPEG, instead of the bundle's: a video for each; another size is "
+      "scaled to cover the frame, and its middle used" },
     { .name = "overwrite", .type = DAR_ARG_FLAG, .target = &o.overwrite,
       .help = "replace what was made with other settings; what was made with these is always kept" },
 
@@ -327,7 +328,7 @@ static dar_status load_reference(dar_bundle *b, const char *path, const char *bu
     if (!path && !b->reference)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found no reference.png, expected --reference IMG", bundle);
     if (!(*rgb = malloc(3 * width * height))) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", bundle);
-    return path ? dar_pictures_load(path, width, height, *rgb, e) : dar_bundle_reference(b, *rgb, e);
+    return path ? dar_pictures_fit(path, width, height, *rgb, e) : dar_bundle_reference(b, *rgb, e);
 }
 
 static void tell_video(struct job *j, const dar_pipeline *p, const struct hearing *h)

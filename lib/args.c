@@ -112,7 +112,8 @@ static bool read_value(const dar_option *o, const char *text)
 
 static dar_status set_value(const dar_program *p, const dar_option *o, const char *text, dar_err *e)
 {
-    if (o->type != DAR_ARG_LIST) return read_value(o, text) ? DAR_OK : bad_value(p, o, text, e);
+    if (o->type != DAR_ARG_LIST && o->type != DAR_ARG_WORDS)
+        return read_value(o, text) ? DAR_OK : bad_value(p, o, text, e);
     dar_arg_list *list = o->target;
     if (list->n == DAR_ARG_MANY)
         return dar_fail(e, DAR_ERR_USAGE, "%s: --%s: given more than %d times", p->name, o->name, DAR_ARG_MANY);
@@ -177,6 +178,8 @@ static dar_status take(struct parser *s, const dar_option *o, const char *joined
         if (s->at == s->argc || strncmp(s->argv[s->at], "--", 2) == 0)
             return dar_fail(e, DAR_ERR_USAGE, "%s: --%s: expected a value %s", s->p->name, o->name, o->placeholder);
         joined = s->argv[s->at++];
+        for (; o->type == DAR_ARG_WORDS && s->at < s->argc && s->argv[s->at][0] != '-'; joined = s->argv[s->at++])
+            DAR_TRY(set_value(s->p, o, joined, e));
     }
     return set_value(s->p, o, joined, e);
 }
@@ -202,6 +205,12 @@ static dar_status check_rest(const dar_program *p, dar_err *e)
 {
     if (p->rests > p->rest_most)
         return dar_fail(e, DAR_ERR_USAGE, "%s: unexpected argument '%s'", p->name, p->rest[p->rest_most]);
+    for (size_t i = 0; p->rests < p->rest_least && i < p->n_options; i++) {
+        const dar_option *o = &p->options[i];
+        if (o->type == DAR_ARG_WORDS && ((dar_arg_list *)o->target)->n > 1)
+            return dar_fail(e, DAR_ERR_USAGE, "%s: expected %s, before --%s, which takes all words that follow",
+                            p->name, p->rest_name, o->name);
+    }
     if (p->rests < p->rest_least)
         return dar_fail(e, DAR_ERR_USAGE, "%s: expected %s; --help tells more", p->name, p->rest_name);
     return DAR_OK;

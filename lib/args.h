@@ -36,6 +36,7 @@ typedef enum dar_arg_type {
     DAR_ARG_CHOICE, /* int: index in names */
     DAR_ARG_SIZE,   /* int64_t[2]: WxH, both from lo to hi */
     DAR_ARG_LIST,   /* dar_arg_list: every value, in order */
+    DAR_ARG_WORDS,  /* the same, of one or more words: all up to the next that begins with '-' */
 } dar_arg_type;
 
 typedef struct dar_arg_list {

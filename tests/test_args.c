@@ -13,7 +13,7 @@ static struct {
     const char *out;
     int solver;
     bool fast;
-    dar_arg_list set;
+    dar_arg_list set, pictures;
     dar_common common;
 } o;
 
@@ -54,6 +54,7 @@ static const dar_option options[] = {
       .hi = 4096,
       .help = "of the picture [px]" },
     { .name = "set", .placeholder = "KEY=VALUE", .type = DAR_ARG_LIST, .target = &o.set, .help = "override" },
+    { .name = "picture", .placeholder = "IMG", .type = DAR_ARG_WORDS, .target = &o.pictures, .help = "several" },
     { .name = "fast", .type = DAR_ARG_FLAG, .target = &o.fast, .help = "skip" },
 };
 
@@ -128,6 +129,28 @@ static void everything(void **state)
     assert_int_equal(parse(&p, WORDS("-odir", "-"), &e), DAR_OK);
     assert_string_equal(o.out, "dir");
     assert_string_equal(p.rest[0], "-");
+}
+
+/* Words end where an option begins, or at --. */
+static void words(void **state)
+{
+    (void)state;
+    dar_program p;
+    dar_err e;
+    assert_int_equal(
+        parse(&p, WORDS("x", "--picture", "a", "b", "--fast", "y", "--picture=c", "z", "--picture", "d", "--", "-w"),
+              &e),
+        DAR_ERR_USAGE);
+    assert_int_equal(
+        parse(&p, WORDS("x", "--picture", "a", "b", "--fast", "--picture=c", "z", "--picture", "d", "--", "-w"), &e),
+        DAR_OK);
+    assert_int_equal(o.pictures.n, 4);
+    for (size_t i = 0; i < 4; i++) assert_string_equal(o.pictures.at[i], ((const char *[]){ "a", "b", "c", "d" })[i]);
+    assert_int_equal(p.rests, 3);
+    assert_string_equal(p.rest[1], "z");
+    assert_string_equal(p.rest[2], "-w");
+    assert_int_equal(parse(&p, WORDS("--picture", "a", "x"), &e), DAR_ERR_USAGE);
+    assert_string_equal(e.text, "dar-test: expected BUNDLE..., before --picture, which takes all words that follow");
 }
 
 static void refusals(void **state)
@@ -359,9 +382,9 @@ static void progress_text(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(defaults),      cmocka_unit_test(everything),   cmocka_unit_test(refusals),
-        cmocka_unit_test(help),          cmocka_unit_test(common_block), cmocka_unit_test(events),
-        cmocka_unit_test(progress_text), cmocka_unit_test(commands),
+        cmocka_unit_test(defaults), cmocka_unit_test(everything),    cmocka_unit_test(words),
+        cmocka_unit_test(refusals), cmocka_unit_test(help),          cmocka_unit_test(common_block),
+        cmocka_unit_test(events),   cmocka_unit_test(progress_text), cmocka_unit_test(commands),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }

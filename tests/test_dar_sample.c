@@ -2,6 +2,7 @@
  * weights in, videos out; what is wrong in one line. */
 #include "tests/run.h"
 
+#include <glob.h>
 #include <signal.h>
 #include <time.h>
 
@@ -96,12 +97,13 @@ static void write_model(const char *path)
     dar_arena_free(&a);
 }
 
-static void write_picture(const char *path, int shade)
+/* Of the clip's size, or twice as large. */
+static void write_picture(const char *path, int shade, size_t times)
 {
-    uint8_t rgb[3 * PIXELS];
+    uint8_t rgb[12 * PIXELS];
     dar_err e;
     for (size_t i = 0; i < sizeof rgb; i++) rgb[i] = (uint8_t)(i * (size_t)shade);
-    assert_int_equal(dar_png_write(path, W, H, 3, rgb, &e), DAR_OK);
+    assert_int_equal(dar_png_write(path, W * times, H * times, 3, rgb, &e), DAR_OK);
 }
 
 static void write_bundles(void)
@@ -126,13 +128,13 @@ static void write_bundles(void)
     for (int t = 0; t < T; t++) {
         char name[32];
         snprintf(name, sizeof name, "frames/%d.png", t);
-        write_picture(name, 3 + t);
+        write_picture(name, 3 + t, 1);
     }
     int status =
         RUN_PROGRAM(bundler, "render", "cube.obj", "-o", "seen", "--size", "40x24", "--frames", "9", "--rgb", "frames");
     CHECK(status == 0, "%s", ran.err);
-    write_picture("a.png", 7);
-    write_picture("b.png", 11);
+    for (int i = 0; i < 5; i++)
+        write_picture((const char *[]){ "a.png", "b.png", "c.png", "d.png", "e.png" }[i], 7 + 4 * i, 1 + (i == 4));
 }
 
 /* ---------------------------------------------------------------- what was made */
@@ -223,7 +225,7 @@ static void any_threads(void **state)
 static void batches(void **state)
 {
     (void)state;
-    GOOD("clip", "seen", "-o", "all", MODEL, "--reference", "a.png", "--reference", "b.png", "--json");
+    GOOD("clip", "seen", "-o", "all", MODEL, "--reference", "a.png", "b.png", "--json");
     CHECK_NEAR("done", printed("done"), 4, 0);
     GOOD("clip", "-o", "alone", MODEL, "--reference", "b.png");
     same_frames("all/clip-b", "alone");
@@ -257,6 +259,88 @@ static void stopped(void **state)
     GOOD("seen", "-o", "cut", "--model", "model", "--steps", "60", "--no-mp4");
     same_frames("whole", "cut");
     run_same_file("whole/sample.json", "cut/sample.json");
+}
+
+#define CLIPS    10
+#define TEN(out) "clip", "seen", "-o", out, MODEL, "--json", "--reference", "a.png", "b.png", "c.png", "d.png", "e.png"
+
+static size_t found(const char *pattern)
+{
+    glob_t g;
+    size_t n = glob(pattern, GLOB_NOSORT, NULL, &g) == 0 ? g.gl_pathc : 0;
+    globfree(&g);
+    return n;
+}
+
+static void clip_path(char path[64], const char *out, size_t i, const char *member)
+{
+    static const char *const bundle[] = { "clip", "seen" };
+    snprintf(path, 64, "%s/%s-%c%s", out, bundle[i / 5], (char)('a' + (char)(i % 5)), member);
+}
+
+/* How many are finished, and which file each is: one that is made again is another. */
+static size_t look_at(ino_t seen[CLIPS])
+{
+    char path[64];
+    struct stat st;
+    size_t n = 0;
+    for (size_t i = 0; i < CLIPS; i++) {
+        clip_path(path, "ten", i, "/sample.json");
+        ino_t now = stat(path, &st) == 0 ? st.st_ino : 0;
+        CHECK(!seen[i] || seen[i] == now, "%s is another", path);
+        seen[i] = now;
+        n += now != 0;
+    }
+    return n;
+}
+
+/* Ten clips, interrupted by a person and killed by the system, between clips and while the frames of one are written:
+ * nothing is done twice, nothing is left over, and all files are those of a run that nobody disturbed. */
+static void ten_clips(void **state)
+{
+    (void)state;
+    static const struct {
+        int signal, expected;
+        bool writing;
+    } how[] = { { SIGKILL, 128 + SIGKILL, true },
+                { SIGINT, 130, false },
+                { SIGINT, 130, true },
+                { SIGKILL, 128 + SIGKILL, false } };
+    ino_t seen[CLIPS] = { 0 };
+    char a[64], b[64];
+    size_t done = 0;
+    GOOD(TEN("straight"));
+    CHECK_NEAR("done", printed("done"), CLIPS, 0);
+    for (size_t k = 0; k < DAR_COUNT(how); k++) {
+        pid_t pid = run_start(program, (const char *const[]){ TEN("ten"), NULL });
+        for (int wait = 0; wait < 40000; wait++) {
+            if (look_at(seen) > done && (!how[k].writing || found("ten/*.tmp-*/frames/00001.png"))) break;
+            nanosleep(&(struct timespec){ .tv_nsec = 500000 }, NULL);
+        }
+        kill(pid, how[k].signal);
+        int status = run_finish(pid);
+        CHECK(status == how[k].expected, "status %d: %s", status, ran.err);
+        done = look_at(seen);
+    }
+    GOOD(TEN("ten"));
+    CHECK_NEAR("done", printed("done"), (double)(CLIPS - done), 0);
+    CHECK_NEAR("kept", printed("kept"), (double)done, 0);
+    look_at(seen);
+    GOOD(TEN("ten"));
+    CHECK_NEAR("kept", printed("kept"), CLIPS, 0);
+    look_at(seen);
+    assert_int_equal(found("ten/*"), CLIPS);
+    for (size_t i = 0; i < CLIPS; i++) {
+        clip_path(a, "straight", i, "");
+        clip_path(b, "ten", i, "");
+        same_frames(a, b);
+        clip_path(a, "straight", i, "/sheet.png");
+        clip_path(b, "ten", i, "/sheet.png");
+        run_same_file(a, b);
+        clip_path(a, "straight", i, "/sample.json");
+        clip_path(b, "ten", i, "/sample.json");
+        run_same_file(a, b);
+    }
 }
 
 static void solvers_and_noise(void **state)
@@ -353,9 +437,9 @@ static int remove_directory(void **state)
 int main(int argc, char **argv)
 {
     static const struct CMUnitTest tests[] = {
-        cmocka_unit_test(a_video),  cmocka_unit_test(any_threads),       cmocka_unit_test(batches),
-        cmocka_unit_test(stopped),  cmocka_unit_test(solvers_and_noise), cmocka_unit_test(dry_run),
-        cmocka_unit_test(refusals),
+        cmocka_unit_test(a_video), cmocka_unit_test(any_threads), cmocka_unit_test(batches),
+        cmocka_unit_test(stopped), cmocka_unit_test(ten_clips),   cmocka_unit_test(solvers_and_noise),
+        cmocka_unit_test(dry_run), cmocka_unit_test(refusals),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
     return cmocka_run_group_tests_name("dar-sample", tests, in_directory, remove_directory) != 0;

@@ -5,6 +5,7 @@
 
 #include "data/image.h"
 #include "data/png.h"
+#include "data/resize.h"
 #include "lib/file.h"
 
 /* Left half (254, 0, 0), right half (0, 0, 254), 16 x 8, quality 100, no subsampling. */
@@ -169,13 +170,71 @@ static void damaged(void **state)
     assert_string_equal(e.text, "p: neither a PNG nor a JPEG picture");
 }
 
+/* Greys, of a function of the column, w x h to width x height. */
+static void resized(uint8_t *y, int (*grey)(size_t x), size_t w, size_t h, size_t width, size_t height)
+{
+    static uint8_t x[3 * 128 * 128];
+    dar_err e;
+    for (size_t i = 0; i < 3 * w * h; i++) x[i] = (uint8_t)grey(i / 3 % w);
+    assert_int_equal(dar_resize("x", x, w, h, y, width, height, &e), DAR_OK);
+}
+
+static int flat(size_t x)
+{
+    (void)x;
+    return 137;
+}
+
+static int ramp(size_t x)
+{
+    return 2 * (int)x;
+}
+
+static int comb(size_t x)
+{
+    return x % 2 ? 254 : 0;
+}
+
+static int thirds(size_t x)
+{
+    return x < 32 || x >= 96 ? 255 : 100;
+}
+
+static void other_sizes(void **state)
+{
+    (void)state;
+    static const size_t size[][4] = { { 7, 5, 12, 9 }, { 60, 40, 8, 4 }, { 1, 1, 5, 3 }, { 128, 3, 2, 7 } };
+    uint8_t y[3 * 128 * 128];
+    for (size_t k = 0; k < DAR_COUNT(size); k++) {
+        const size_t *s = size[k];
+        resized(y, flat, s[0], s[1], s[2], s[3]);
+        for (size_t i = 0; i < 3 * s[2] * s[3]; i++) assert_int_equal(y[i], 137);
+    }
+    resized(y, comb, 128, 8, 128, 8); /* nothing to do */
+    for (size_t i = 0; i < 3 * 128 * 8; i++) assert_int_equal(y[i], comb(i / 3 % 128));
+
+    /* Away from the edges: a pixel of half the size lies between two of before; a comb finer than its pixels is grey,
+     * but for the ripple of three lobes, below 2 in 255. */
+    resized(y, ramp, 120, 40, 60, 20);
+    for (size_t i = 6; i < 54; i++) CHECK_NEAR("ramp", y[3 * i], 4 * (double)i + 1, 0.51);
+    resized(y, comb, 128, 40, 64, 20);
+    for (size_t i = 6; i < 58; i++) CHECK_NEAR("comb", y[3 * i], 127, 2.5);
+
+    /* Another aspect: the middle is seen. */
+    dar_resize_part p = dar_resize_cover(128, 32, 32, 16);
+    CHECK_NEAR("left", p.left, 32, 0);
+    CHECK_NEAR("top", p.top, 0, 0);
+    CHECK_NEAR("width", p.width, 64, 0);
+    CHECK_NEAR("height", p.height, 32, 0);
+    resized(y, thirds, 128, 32, 32, 16);
+    for (size_t i = 3; i < 29; i++) assert_int_equal(y[3 * i], 100);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(whole),
-        cmocka_unit_test(jpeg_colors),
-        cmocka_unit_test(written),
-        cmocka_unit_test(damaged),
+        cmocka_unit_test(whole),   cmocka_unit_test(jpeg_colors), cmocka_unit_test(written),
+        cmocka_unit_test(damaged), cmocka_unit_test(other_sizes),
     };
     return cmocka_run_group_tests_name("image", tests, NULL, NULL) != 0;
 }
