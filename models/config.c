@@ -52,10 +52,22 @@ static void read_list(dar_json j, const char *key, int most, int *n, int64_t *ou
     *n = 0;
     for (dar_json x = dar_json_first(list); x.item; x = dar_json_next(x)) {
         int64_t value = dar_json_int(x, NULL, DAR_JSON_NEEDED, 1, MOST);
-        if (*n < most) out[*n] = value;
+        if (*n < most) out[*n] = value < 1 ? 1 : value;
         ++*n;
     }
     if (*n < 1 || *n > most) dar_json_reject(j, key, "1 to %d numbers", most);
+}
+
+/* Shortcuts join levels of any widths whose channels, with those of the pixels that become one, make equal groups. */
+static bool shortcuts_fit(const dar_vae_config *c)
+{
+    for (int i = 0; i < c->levels; i++) {
+        int64_t before = i ? c->multipliers[i - 1] : 1, here = c->multipliers[i];
+        bool halves = i < c->levels - 1;
+        if ((halves || here != before) && before * (halves ? 4 << c->halve_time[i] : 1) % here) return false;
+        if (i && here * (4 << c->halve_time[i - 1]) % c->multipliers[i < c->levels - 1 ? i + 1 : i]) return false;
+    }
+    return true;
 }
 
 static void read_vae(dar_vae_config *c, dar_json j, int64_t latent)
@@ -74,6 +86,10 @@ static void read_vae(dar_vae_config *c, dar_json j, int64_t latent)
         c->halve_time[i < DAR_VAE_LEVELS ? i : 0] = dar_json_bool(x, NULL, false);
     if ((halve.item ? i : (int)DAR_COUNT(halve_time)) != c->levels - 1)
         dar_json_reject(j, "halve_time", "one value less than multipliers");
+    else if (!shortcuts_fit(c))
+        dar_json_reject(j, "multipliers",
+                        "of two neighbours, each to divide 8 times the other (4 times where time is not halved), the "
+                        "last the one before");
     c->patch = dar_json_int(j, "patch", 2, 1, 16);
     c->encoder_width = dar_json_int(j, "encoder_width", 160, 1, MOST);
     c->decoder_width = dar_json_int(j, "decoder_width", 256, 1, MOST);

@@ -21,8 +21,9 @@ static void presets_are_whole(void **state)
     for (size_t i = 0; i < DAR_COUNT(name); i++) {
         dar_config c = model_preset(name[i]);
         assert_string_equal(c.name, name[i]);
-        /* A token is as many pixels for the adapter as for a latent that is 16 or 8 times smaller. */
-        if (i < 2) assert_int_equal(2 * c.adapter.unshuffle, c.dit.patch * (i ? 8 : 16));
+        /* A token is as many pixels for the adapter as for latent and patch. */
+        if (i < 2) assert_int_equal(2 * c.adapter.unshuffle, c.dit.patch * dar_vae_shrink(&c.vae));
+        assert_int_equal(dar_vae_shrink_time(&c.vae), c.dit.mask);
     }
     dar_config c = model_preset("wan22-fun-5b");
     assert_int_equal(dar_dit_channels(&c.dit), 100);
@@ -81,6 +82,12 @@ static void wrong_ones_are_told(void **state)
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"adapter\": { \"widen\": \"zero\" } }", "copy, fresh" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"adapter\": { \"blocks\": 9 } }", "adapter.blocks" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"lora\": { \"targets\": [ \"q\" ] } }", "self_attn.q" },
+        { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"vae\": { \"multipliers\": [ 1, 2 ] } }", "vae.halve_time" },
+        { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"vae\": { \"multipliers\": [ 1, 0, 4, 4 ] } }", "from 1" },
+        { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"vae\": { \"multipliers\": [ 1, 2, 4, 8 ] } }",
+          "vae.multipliers" },
+        { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"vae\": { \"multipliers\": [ 1, 3, 4, 4 ] } }",
+          "vae.multipliers" },
     };
     for (size_t i = 0; i < DAR_COUNT(bad); i++) {
         dar_config c;

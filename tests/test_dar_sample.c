@@ -398,7 +398,10 @@ static void refusals(void **state)
     BAD(2, "expected -o DIR", "clip", MODEL);
     BAD(2, "expected --model", "clip", "-o", "x");
     BAD(2, "preset", "clip", "-o", "x", "--model", "nothing");
-    BAD(2, "no vae", "clip", "-o", "x", "--model", "dar-tiny");
+    static const char blind[] =
+        "{ \"name\": \"x\", \"dit\": { \"width\": 20, \"heads\": 2, \"layers\": 1, \"ffn\": 8 } }";
+    run_write("blind.json", blind, sizeof blind - 1);
+    BAD(2, "no vae", "clip", "-o", "x", "--model", "blind.json");
     BAD(2, "--dit FILE", "clip", "-o", "x", "--model", "wan22-fun-5b");
     BAD(2, "nowhere: No such", "nowhere", "-o", "x", MODEL);
     BAD(2, "expected 1, 5, 9", "uneven", "-o", "x", MODEL, "--reference", "a.png");
