@@ -34,9 +34,9 @@ static int remove_entry(const char *path, const struct stat *st, int type, struc
     return remove(path);
 }
 
-static void remove_tree(const char *path)
+static int remove_tree(const char *path)
 {
-    nftw(path, remove_entry, OPEN_MOST, FTW_DEPTH | FTW_PHYS);
+    return nftw(path, remove_entry, OPEN_MOST, FTW_DEPTH | FTW_PHYS);
 }
 
 static int flush_entry(const char *path, const struct stat *st, int type, struct FTW *at)
@@ -63,6 +63,12 @@ static int lock_directory(const char *path, bool *locked)
     close(fd);
     errno = EWOULDBLOCK;
     return -1;
+}
+
+bool dar_dir_temporary(const char *name)
+{
+    const char *at = strstr(name, mark);
+    return at && at > name && at[strlen(mark)] && !at[strlen(mark) + strspn(at + strlen(mark), "0123456789-")];
 }
 
 /* Remove what dead writers of the target left. */
@@ -164,4 +170,24 @@ void dar_dir_discard(dar_dir_out *o)
     if (o->lock >= 0) close(o->lock);
     o->lock = -1;
     o->temp[0] = 0;
+}
+
+/* ---------------------------------------------------------------- directories that are there */
+
+dar_status dar_dir_remove(const char *path, dar_err *e)
+{
+    char gone[PATH_MAX];
+    int n = snprintf(gone, sizeof gone, "%s%s%ld", path, mark, (long)getpid());
+    bool moved = n < (int)sizeof gone && rename(path, gone) == 0;
+    if (moved) dar_file_flush_entry(gone);
+    return remove_tree(moved ? gone : path) == 0 ? DAR_OK : refused(path, errno, e);
+}
+
+dar_status dar_dir_lock(int *fd, const char *path, dar_err *e)
+{
+    bool locked;
+    *fd = lock_directory(path, &locked);
+    if (*fd >= 0) return DAR_OK;
+    if (errno != EWOULDBLOCK) return refused(path, errno, e);
+    return dar_fail(e, DAR_ERR_USAGE, "%s: another program is writing there", path);
 }

@@ -31,4 +31,15 @@ dar_status dar_dir_commit(dar_dir_out *o, bool overwrite, dar_err *e);
 /* Remove what was not committed.  Accepts a committed or zeroed one. */
 void dar_dir_discard(dar_dir_out *o);
 
+/* Remove a file or directory with all that it holds: under a temporary name, so that a kill leaves no half of it under
+ * its own. */
+dar_status dar_dir_remove(const char *path, dar_err *e);
+
+/* Hold an existing directory: only one program at a time can.  close(*fd) gives it back; on failure *fd is -1. */
+dar_status dar_dir_lock(int *fd, const char *path, dar_err *e);
+
+/* Whether a name is one that writers of files or directories use before they rename: NAME.tmp-DIGITS, and more digits.
+ */
+bool dar_dir_temporary(const char *name);
+
 #endif
