@@ -85,8 +85,8 @@ char *dar_log_duration(double seconds, char *buf, size_t size)
 char *dar_progress_text(const dar_progress *p, double seconds, const char *note, char *buf, size_t size)
 {
     char rate[64] = "", left[64] = "", time[32];
-    if (p->done > 0 && seconds > 0) {
-        double r = p->done / seconds;
+    if (p->done > p->from && seconds > 0) {
+        double r = (p->done - p->from) / seconds;
         if (r >= 1) snprintf(rate, sizeof rate, ", %.3g %s/s", r, p->unit);
         else snprintf(rate, sizeof rate, ", %s each", dar_log_duration(1 / r, time, sizeof time));
         if (p->done < p->total)

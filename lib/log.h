@@ -26,6 +26,7 @@ void dar_log(dar_log_level level, const char *fmt, ...) __attribute__((format(pr
 typedef struct dar_progress {
     const char *what, *unit;
     double total, done;
+    double from;         /* done before it began; the caller's to set: it counts for the share, not for the speed */
     double begun, shown; /* [s] of a monotonic clock */
     double interval;     /* [s] between two lines */
 } dar_progress;

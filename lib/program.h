@@ -27,8 +27,9 @@ int dar_program_main(const dar_program *program, int argc, char **argv);
 /* A line of the result for people; with --json nothing. */
 void dar_run_say(const dar_run *r, const char *fmt, ...) __attribute__((format(printf, 2, 3)));
 
-/* Whether the person (SIGINT) or the system (SIGTERM) asked to stop: save what is worth it and return
- * DAR_ERR_INTERRUPTED.  Asked a second time, the program ends at once. */
+/* Whether the person (SIGINT), the system (SIGTERM) or a batch queue whose time is nearly up (SIGUSR1) asked to stop:
+ * save what is worth it and return DAR_ERR_INTERRUPTED.  Asked a second time in the same way, the program ends at once.
+ */
 bool dar_interrupted(void);
 
 #endif

@@ -1,11 +1,17 @@
-/* test_args.c: command lines, help, events and progress. */
+/* test_args.c: command lines, help, events, progress, signals to stop. */
 #include "tests/test.h"
 
 #include <fcntl.h>
+#include <signal.h>
+#include <spawn.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 #include "lib/args.h"
 #include "lib/log.h"
+#include "lib/program.h"
+
+extern char **environ;
 
 static struct {
     int64_t steps, size[2];
@@ -374,17 +380,61 @@ static void progress_text(void **state)
                         "train: 130/1300 steps, 10 %, 2 steps/s, 9 min 45 s left, loss 0.031");
     assert_string_equal(dar_progress_text(&p, 260, NULL, buf, sizeof buf),
                         "train: 130/1300 steps, 10 %, 2.0 s each, 39 min 0 s left");
+    p.from = 100; /* a run that was taken up there */
+    assert_string_equal(dar_progress_text(&p, 60, NULL, buf, sizeof buf),
+                        "train: 130/1300 steps, 10 %, 2.0 s each, 39 min 0 s left");
+    p.from = 0;
     p.done = 1300;
     assert_string_equal(dar_progress_text(&p, 650, NULL, buf, sizeof buf),
                         "train: 1300/1300 steps, 100 %, 2 steps/s, 10 min 50 s in all");
 }
 
-int main(void)
+static int signal_number;
+
+static dar_status until_asked(dar_run *r, dar_err *e)
 {
+    assert_false(dar_interrupted());
+    raise(signal_number);
+    assert_true(dar_interrupted());
+    return dar_fail(e, DAR_ERR_INTERRUPTED, "%s: saved", r->program->name);
+}
+
+/* Each of the signals lets the program save and end with 130.  The flag stays, so each has a process of its own. */
+static int asked_to_stop(const char *number)
+{
+    static const dar_program program = { .name = "saver", .run = until_asked };
+    char *argv[] = { "saver", NULL };
+    signal_number = (int)strtol(number, NULL, 10);
+    return dar_program_main(&program, 1, argv);
+}
+
+static char *self;
+
+static void stop_signals(void **state)
+{
+    (void)state;
+    static const int asked[] = { SIGINT, SIGTERM, SIGUSR1 };
+    for (size_t i = 0; i < DAR_COUNT(asked); i++) {
+        char number[16];
+        snprintf(number, sizeof number, "%d", asked[i]);
+        char *argv[] = { self, number, NULL };
+        pid_t pid;
+        int how;
+        assert_int_equal(posix_spawn(&pid, self, NULL, NULL, argv, environ), 0);
+        assert_int_equal(waitpid(pid, &how, 0), pid);
+        CHECK(WIFEXITED(how) && WEXITSTATUS(how) == 130, "signal %s: ended as %d", number, how);
+    }
+}
+
+int main(int argc, char **argv)
+{
+    if (argc == 2) return asked_to_stop(argv[1]);
+    self = argv[0];
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(defaults), cmocka_unit_test(everything),    cmocka_unit_test(words),
-        cmocka_unit_test(refusals), cmocka_unit_test(help),          cmocka_unit_test(common_block),
-        cmocka_unit_test(events),   cmocka_unit_test(progress_text), cmocka_unit_test(commands),
+        cmocka_unit_test(defaults),     cmocka_unit_test(everything),    cmocka_unit_test(words),
+        cmocka_unit_test(refusals),     cmocka_unit_test(help),          cmocka_unit_test(common_block),
+        cmocka_unit_test(events),       cmocka_unit_test(progress_text), cmocka_unit_test(commands),
+        cmocka_unit_test(stop_signals),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
