@@ -32,7 +32,8 @@ void dar_optim_init(dar_optim *o, const dar_optim_config *c, dar_params *p, dar_
         if (!a->plan) o->m[i] = o->v[i] = none;
         if (!q->trainable) continue;
         DAR_ASSERT(q->g.data, "optim: %s has no gradient memory", q->name);
-        dar_tensor m = dar_tensor_push(a, p->main, q->x.shape), v = dar_tensor_push(a, p->main, q->x.shape);
+        dar_dtype type = c->bf16_moments ? DAR_BF16 : p->main;
+        dar_tensor m = dar_tensor_push(a, type, q->x.shape), v = dar_tensor_push(a, type, q->x.shape);
         if (a->plan) continue;
         dar_tensor_fill(&m, 0);
         dar_tensor_fill(&v, 0);
@@ -83,7 +84,7 @@ dar_optim_report dar_optim_step(dar_optim *o)
         dar_param *q = p->at[i];
         if (!q->trainable) continue;
         if (!r.skipped)
-            dar_row_adamw(&a, p->main, p->main, dar_tensor_count(&q->x), q->x.data, o->m[i].data, o->v[i].data,
+            dar_row_adamw(&a, p->main, o->m[i].dtype, dar_tensor_count(&q->x), q->x.data, o->m[i].data, o->v[i].data,
                           q->g.data);
         dar_tensor_fill(&q->g, 0);
     }
