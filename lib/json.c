@@ -358,6 +358,26 @@ static cJSON *enter(dar_json j, const char *key, cJSON *made)
     return NULL;
 }
 
+static void forget_asked(cJSON *x)
+{
+    x->type &= ~(ASKED | ACCEPT);
+    for (cJSON *c = x->child; c; c = c->next) forget_asked(c);
+}
+
+static void merge(dar_json_doc *doc, cJSON *to, const cJSON *from)
+{
+    for (const cJSON *c = from->child; c; c = c->next) {
+        cJSON *old = cJSON_GetObjectItemCaseSensitive(to, c->string);
+        if (old && cJSON_IsObject(old) && cJSON_IsObject(c)) merge(doc, old, c);
+        else if ((old = enter((dar_json){ doc, to }, c->string, cJSON_Duplicate(c, true)))) forget_asked(old);
+    }
+}
+
+void dar_json_merge(dar_json to, dar_json from)
+{
+    if (cJSON_IsObject((cJSON *)to.item) && cJSON_IsObject((cJSON *)from.item)) merge(to.doc, to.item, from.item);
+}
+
 /* Nothing or null stands at j.key. */
 static void missing(dar_json j, const char *key, const char *expected)
 {

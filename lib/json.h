@@ -106,7 +106,9 @@ void dar_json_accept(dar_json j);
  * reads above cannot express. */
 void dar_json_reject(dar_json j, const char *key, const char *expected, ...) __attribute__((format(printf, 3, 4)));
 
-/* ---------------------------------------------------------------- */
+/* Members of `from`, an object of any document, take the place of those of `to` with the same name, or are added; where
+ * both are objects, so do theirs.  Short of memory, dar_json_finish of `to` tells. */
+void dar_json_merge(dar_json to, dar_json from);
 
 /* Print a value with everything below it. */
 void dar_json_write_value(dar_json_writer *w, const char *key, dar_json j);

@@ -128,6 +128,29 @@ static void many_keys(void **state)
 
 static const char *const solvers[] = { "euler", "ab2", "unipc", NULL };
 
+static void merging(void **state)
+{
+    (void)state;
+    dar_json_doc *to = good("{\"a\": {\"b\": 1, \"c\": [1, 2]}, \"d\": {\"x\": 0}, \"e\": null}");
+    dar_json_doc *from = good("{\"a\": {\"c\": [3], \"n\": {\"m\": true}}, \"d\": 5, \"e\": {\"y\": 1}}");
+    dar_err e;
+    dar_json_int(dar_json_object(dar_json_root(from), "e"), "y", 0, 0, 9);
+    dar_json_merge(dar_json_root(to), dar_json_root(from));
+    dar_json_close(from);
+    dar_json_writer w = { 0 };
+    dar_json_write_value(&w, NULL, dar_json_root(to));
+    same_text(w.text, "{\"a\": {\"b\": 1, \"c\": [3], \"n\": {\"m\": true}}, \"d\": 5, \"e\": {\"y\": 1}}");
+    dar_json_writer_free(&w);
+
+    dar_json a = dar_json_object(dar_json_root(to), "a"), y = dar_json_object(dar_json_root(to), "e");
+    dar_json_accept(a); /* what nobody reads of the rest is told, read before or not */
+    dar_json_int(dar_json_root(to), "d", 0, 0, 9);
+    (void)y;
+    assert_int_equal(dar_json_finish(to, &e), DAR_ERR_FORMAT);
+    CHECK(strstr(e.text, "e.y"), "%s", e.text);
+    dar_json_close(to);
+}
+
 static void typed_reads(void **state)
 {
     (void)state;
@@ -429,9 +452,11 @@ static void distances(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(grammar),   cmocka_unit_test(depth),     cmocka_unit_test(many_keys),
-        cmocka_unit_test(messages),  cmocka_unit_test(overrides), cmocka_unit_test(typed_reads),
-        cmocka_unit_test(printing),  cmocka_unit_test(files),     cmocka_unit_test(numbers_round_trip),
+        cmocka_unit_test(grammar),     cmocka_unit_test(depth),
+        cmocka_unit_test(many_keys),   cmocka_unit_test(messages),
+        cmocka_unit_test(overrides),   cmocka_unit_test(merging),
+        cmocka_unit_test(typed_reads), cmocka_unit_test(printing),
+        cmocka_unit_test(files),       cmocka_unit_test(numbers_round_trip),
         cmocka_unit_test(distances),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
