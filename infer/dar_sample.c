@@ -11,6 +11,7 @@
 #include "lib/log.h"
 #include "lib/program.h"
 #include "lib/sha256.h"
+#include "models/rate.h"
 
 #define MOST 1000 /* bundles of one call */
 
@@ -411,7 +412,7 @@ static void tell_plan(struct job *j, const dar_pipeline *p, const char *bundle)
     for (int k = 0; k < DAR_SKIP_LORA; k++) dar_json_write_number(w, dar_skip_name[k], p->saved[k]);
     dar_json_write_end(w);
     if (!o.common.dry_run) return;
-    double seconds = (p->prepare + (double)videos * video) / dar_pipeline_rate((dar_dtype)o.precision);
+    double seconds = (p->prepare + (double)videos * video) / dar_rate((dar_dtype)o.precision);
     dar_run_say(j->r,
                 "%s: %zu video%s of %zu frames of %d x %d: %.2f GB of memory (weights %.2f), %.3g TFLOP, at least %s",
                 bundle, videos, videos == 1 ? "" : "s", p->b->meta.frames, p->b->meta.width, p->b->meta.height,

@@ -64,7 +64,4 @@ typedef struct dar_pipeline_listener {
 /* Render with a reference rgb [H, W, 3].  May be called again. */
 dar_status dar_pipeline_render(dar_pipeline *p, const uint8_t *reference, const dar_pipeline_listener *l, dar_err *e);
 
-/* Products in this storage type that this machine does in a second [FLOP], tried for a moment. */
-double dar_pipeline_rate(dar_dtype storage);
-
 #endif
