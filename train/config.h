@@ -1,0 +1,139 @@
+/* config.h: what a training run is, read from JSON: train/configs and --set key=value.
+ *
+ * A file may name another as its "base", relative to itself: keys it does not give are those of the base.  Every key
+ * is a line of the table in config.c; their names are those that users of other trainers know.
+ *
+ *   key                          values           default  what
+ *   model                        text             needed   preset, .json or directory (models/model.h)
+ *   weights                      text             null     directory of its weights; null: that of the model's file
+ *   parts.dit .vae .adapter .lora  text           null     files of them instead
+ *   train                        lora | full | vae  lora   low-rank additions and adapter; transformer and adapter; the
+ *                                                          autoencoder
+ *   from_scratch                 bool             false    weights that no file has are drawn by the seed
+ *   data                         list of texts    needed   bundles, or directories of them
+ *   condition                    object           {}       keys of data/condition.h, over those of the model
+ *   adapter                      object           {}       keys of models/config.h, likewise: blocks, widen
+ *   output_dir                   text             needed   the run's directory
+ *   cache_dir                    text             null     of latents; null: cache in the directory above the run's
+ *   seed                         0 ..             0
+ *
+ *   rank                         1 ..             256      of low-rank additions
+ *   network_alpha                >= 0             0        they count alpha / rank times; 0: rank
+ *   target_modules               list of names    all ten  of models/config.h, lora.targets
+ *   mixed_precision              f64 | f32 | bf16  bf16    of products' operands and frozen weights; sums, trained
+ *                                                          weights and what is listed in models/dit.h are f32 or wider
+ *   gradient_checkpointing       auto | none | selective | full   auto   keep everything; blocks are run again in
+ *                                                          backward, but their attention; they are run again
+ *   memory_budget                >= 0 [GB]        0        of which auto takes the fastest that fits; 0: the machine's
+ *
+ *   learning_rate                >= 0             1e-4
+ *   lr_scheduler                 constant | linear | cosine   constant   down to 0 over the last lr_decay_steps
+ *   lr_warmup_steps              0 ..             200
+ *   lr_decay_steps               0 ..             0        0: all steps after the warm-up
+ *   adam_beta1, adam_beta2       0 .. 1           0.9, 0.999
+ *   adam_epsilon                 > 0              1e-10
+ *   adam_weight_decay            >= 0             0.03
+ *   adam_moments                 f32 | bf16       f32      bf16: half the memory, rounded at random
+ *   max_grad_norm                >= 0             0.05     0: no clipping
+ *   max_bad_steps                1 ..             20       in a row, whose gradients are not finite
+ *   max_train_steps              1 ..             10000
+ *   train_batch_size             1 ..             1
+ *   gradient_accumulation_steps  1 ..             1        batches to a step
+ *   prefetch                     0 ..             2        batches read ahead
+ *   checkpointing_steps          0 ..             2000     0: only at the end
+ *   checkpoints_total_limit      1 ..             5
+ *   save_merged                  bool             false    dit.safetensors beside the last checkpoint: additions merged
+ *
+ *   loss.shift                   > 0              5        of the table of sigmas
+ *   loss.density                 uniform | logit_normal | mode | cosmap   uniform   how they are drawn
+ *   loss.stratified              bool             false    those of a batch from equal parts of that
+ *   loss.weighting               flat | bell      flat     how they count
+ *   loss.first_frame             exclude | include | noisy   exclude   the first latent frame: clean, at time 0, and
+ * not counted; counted, as in VideoX-Fun; noisy like the others text.dropout                 0 .. 1           0.1 clips
+ * whose text is left out text.empty                   text             null     file with the embedding of the empty
+ * prompt, which stands for a text left out, or none; null: no token posterior                    mean | sample    mean
+ * of the autoencoder, for clean latents
+ *
+ *   validation.data              list of texts    []       bundles to look at while training
+ *   validation.steps             0 ..             1000     every so many steps; 0: never
+ *   validation.clips             1 ..             4        at most so many of them are sampled
+ *   validation.sampler_steps     1 ..             20
+ *   validation.sensitivity       0 ..             8        clips whose loss is also taken with another's condition
+ */
+#ifndef DAR_TRAIN_CONFIG_H
+#define DAR_TRAIN_CONFIG_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "data/condition.h"
+#include "lib/json.h"
+#include "models/flow.h"
+#include "models/model.h"
+
+typedef enum dar_train_what { DAR_TRAIN_LORA, DAR_TRAIN_FULL, DAR_TRAIN_VAE } dar_train_what;
+typedef enum dar_recompute {
+    DAR_RECOMPUTE_AUTO,
+    DAR_RECOMPUTE_NONE,
+    DAR_RECOMPUTE_MOST,
+    DAR_RECOMPUTE_ALL
+} dar_recompute;
+typedef enum dar_lr_scheduler { DAR_LR_CONSTANT, DAR_LR_LINEAR, DAR_LR_COSINE } dar_lr_scheduler;
+typedef enum dar_first_frame { DAR_FIRST_EXCLUDE, DAR_FIRST_INCLUDE, DAR_FIRST_NOISY } dar_first_frame;
+
+extern const char *const dar_recompute_name[]; /* "auto", ..., NULL */
+
+/* Texts live as long as the configuration.  Choices are int: rows of one table read them. */
+typedef struct dar_train_config {
+    const char *model, *weights, *part[DAR_MODEL_PARTS];
+    int what; /* dar_train_what */
+    bool from_scratch;
+    const char *output, *cache;
+    int64_t seed;
+
+    int64_t rank;
+    double alpha;
+    int storage;   /* dar_dtype */
+    int recompute; /* dar_recompute */
+    double budget; /* [GB] */
+
+    double rate;
+    int scheduler; /* dar_lr_scheduler */
+    int64_t warmup, decay_steps;
+    double beta1, beta2, eps, decay, max_norm;
+    int moments; /* 0: f32, 1: bf16 */
+    int64_t patience, steps, batch, accumulate, ahead;
+    int64_t save_every, keep;
+    bool save_merged;
+
+    double shift;
+    int density, weighting; /* dar_flow_density, dar_flow_weighting */
+    bool stratified;
+    int first; /* dar_first_frame */
+    double text_dropout;
+    const char *text_empty;
+    int posterior; /* 0: mean, 1: sample */
+
+    int64_t validate_every, validate_clips, validate_steps, sensitivity;
+
+    /* Of the model, with what the keys above say of it. */
+    dar_model_file file;
+    dar_condition condition;
+
+    dar_json_doc *doc; /* resolved */
+} dar_train_config;
+
+/* Read a file, then `n` assignments "key=value"; then the model that it names.  On failure *c is closed. */
+dar_status dar_train_config_open(dar_train_config *c, const char *path, const char *const *set, size_t n, dar_err *e);
+void dar_train_config_close(dar_train_config *c); /* accepts a zeroed one */
+
+/* The texts of a list: "data", or "validation.data". */
+dar_json dar_train_config_list(const dar_train_config *c, const char *group, const char *key);
+
+/* Learning rate of step k = 0, 1, ..., of which the warm-up is the optimiser's. */
+double dar_train_rate(const dar_train_config *c, int64_t k);
+
+/* The resolved configuration as JSON text. */
+void dar_train_config_print(const dar_train_config *c, dar_json_writer *w);
+
+#endif
