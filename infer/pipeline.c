@@ -7,7 +7,6 @@
 #include <unistd.h>
 
 #include "data/rays.h"
-#include "lib/log.h"
 
 /* ---------------------------------------------------------------- what comes from files */
 
