@@ -1,24 +1,31 @@
 /* dar_bundle_synth.c: sets of synthetic bundles.
  *
- * A bundle is made and checked under the name ".making", then renamed: one that has its own name is finished, and says
- * in meta.json, "qc", how it was made.  So a run that died goes on where it was, and the manifest is told from the
- * bundles alone. */
+ * A bundle is made and checked in a directory beside the others, then renamed: one that has its own name is finished,
+ * and says in meta.json, "qc", how it was made.  So a run that died goes on where it was, and the manifest is told from
+ * the bundles alone.
+ *
+ * Every thread makes bundles of its own: frames are small, and threads that share one wait for each other. */
 #include <errno.h>
 #include <math.h>
+#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <unistd.h>
 
 #include "data/dar_bundle.h"
 #include "data/quality.h"
 #include "data/sheet.h"
 #include "data/synth_film.h"
 #include "data/synth_set.h"
+#include "lib/dir.h"
 #include "lib/file.h"
 #include "lib/json.h"
 #include "lib/log.h"
+#include "lib/thread.h"
 
+#define MAKING   ".making"
 #define ATTEMPTS 8   /* scenes for one bundle */
 #define MOST     1e7 /* bundles */
 #define COLUMNS  8   /* of the contact sheet */
@@ -56,13 +63,25 @@ static const dar_option options[] = {
 };
 /* clang-format on */
 
+/* Where the time of a bundle went [s]. */
+struct times {
+    double make, check, render[DAR_RENDER_STAGES];
+};
+
 /* Of the run. */
 struct job {
     const dar_synth_set *set;
-    dar_synth_plan plan;
-    size_t count, made, found;
-    double making, checking; /* [s] */
-    dar_render_report sum;
+    dar_synth_plan plan;          /* what all bundles share */
+    size_t count, *missing, todo; /* missing: numbers of the bundles, todo of them */
+    dar_dir_out making;           /* never gets its name: what is in it moves out */
+
+    /* What threads share. */
+    pthread_mutex_t lock;
+    dar_progress progress;
+    struct times sum;
+    size_t made;
+    dar_status status; /* the first failure, told in e */
+    dar_err *e;
 };
 
 static void name_of(char path[PATH_MAX], size_t index)
@@ -80,14 +99,10 @@ static bool is_there(const char *path)
 
 /* Of one attempt; why: empty if it is good. */
 struct attempt {
+    struct times times;
     dar_quality quality;
     char why[DAR_QUALITY_TEXT];
 };
-
-static void add_times(struct job *j, const dar_render_report *r)
-{
-    for (int i = 0; i < DAR_RENDER_STAGES; i++) j->sum.seconds[i] += r->seconds[i];
-}
 
 static dar_status judge(const char *path, struct attempt *a, dar_err *e)
 {
@@ -100,35 +115,38 @@ static dar_status judge(const char *path, struct attempt *a, dar_err *e)
     return s;
 }
 
+static void say_what(const dar_synth *s, dar_json_writer *w)
+{
+    dar_json_write_text(w, "kind", s->thing[0].kind->name);
+    dar_json_write_text(w, "family", s->thing[0].kind->family);
+    dar_json_write_text(w, "lights", s->lights);
+    dar_json_write_int(w, "things", (int64_t)s->things);
+    dar_json_write_int(w, "dropped", (int64_t)s->dropped);
+}
+
 /* Make bundle `index` at path.  A scene that cannot be filmed, or a bundle that is not fit, is no failure. */
-static dar_status attempt(struct job *j, size_t index, size_t n, const char *path, struct attempt *a,
+static dar_status attempt(const struct job *j, size_t index, size_t n, const char *path, struct attempt *a,
                           dar_json_writer *w, dar_err *e)
 {
     dar_synth s;
+    dar_synth_plan plan = j->plan;
     dar_render_report report;
     double begun = dar_log_clock();
-    *a = (struct attempt){ 0 };
-    dar_synth_set_plan(j->set, o.common.seed, index, n, o.family, &j->plan);
-    dar_status status = dar_synth_make(&s, &j->plan, e);
-    double made = dar_log_clock();
-    j->making += made - begun;
+    a->why[0] = 0;
+    dar_synth_set_plan(j->set, o.common.seed, index, n, o.family, &plan);
+    dar_status status = dar_synth_make(&s, &plan, e);
+    a->times.make += dar_log_clock() - begun;
     if (status == DAR_OK) {
-        status = dar_synth_film(&s, &j->plan, j->set->name, path, &report, e);
-        if (status == DAR_OK) add_times(j, &report);
+        status = dar_synth_film(&s, &plan, j->set->name, path, &report, e);
+        for (int i = 0; i < DAR_RENDER_STAGES; i++) a->times.render[i] += report.seconds[i];
         begun = dar_log_clock();
         if (status == DAR_OK) status = judge(path, a, e);
-        j->checking += dar_log_clock() - begun;
+        a->times.check += dar_log_clock() - begun;
     } else if (status == DAR_ERR_CHECK) {
         snprintf(a->why, sizeof a->why, "camera: %s", e->text);
         status = DAR_OK;
     }
-    if (status == DAR_OK && !a->why[0]) {
-        dar_json_write_text(w, "kind", s.thing[0].kind->name);
-        dar_json_write_text(w, "family", s.thing[0].kind->family);
-        dar_json_write_text(w, "lights", s.lights);
-        dar_json_write_int(w, "things", (int64_t)s.things);
-        dar_json_write_int(w, "dropped", (int64_t)s.dropped);
-    }
+    if (status == DAR_OK && !a->why[0]) say_what(&s, w);
     dar_synth_free(&s);
     return status;
 }
@@ -143,40 +161,131 @@ static dar_status finish(const char *from, const char *to, dar_json_writer *w, d
     return error ? dar_fail(e, DAR_ERR_IO, "%s: %s", to, strerror(error)) : DAR_OK;
 }
 
-static dar_status make_one(struct job *j, size_t index, const char *path, dar_err *e)
+static dar_status make_one(const struct job *j, size_t index, struct attempt *a, dar_err *e)
 {
-    char making[PATH_MAX];
-    struct attempt a = { 0 };
-    dar_json_writer w = { 0 };
+    char making[PATH_MAX], path[PATH_MAX];
+    dar_json_writer w = { 0 }, good = { 0 };
     dar_status s = DAR_OK;
     size_t n = 0;
-    snprintf(making, sizeof making, "%s/.making", o.out);
+    name_of(path, index);
+    if (snprintf(making, sizeof making, "%s/%06zu", j->making.temp, index) >= (int)sizeof making)
+        return dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(ENAMETOOLONG));
     dar_json_write_object(&w, NULL);
     dar_json_write_array(&w, "rejected");
-    dar_json_writer good = { 0 };
     for (; n < ATTEMPTS; n++) {
         dar_json_writer_reset(&good);
         dar_json_write_object(&good, NULL);
-        s = attempt(j, index, n, making, &a, &good, e);
+        s = attempt(j, index, n, making, a, &good, e);
         dar_json_write_end(&good);
-        if (s != DAR_OK || !a.why[0]) break;
-        dar_json_write_text(&w, NULL, a.why);
+        if (s != DAR_OK || !a->why[0]) break;
+        dar_json_write_text(&w, NULL, a->why);
     }
     dar_json_write_end(&w);
     if (s == DAR_OK && n == ATTEMPTS)
-        s = dar_fail(e, DAR_ERR_CHECK, "%s: none of %d scenes was fit; the last: %s", path, ATTEMPTS, a.why);
+        s = dar_fail(e, DAR_ERR_CHECK, "%s: none of %d scenes was fit; the last: %s", path, ATTEMPTS, a->why);
     if (s == DAR_OK) {
         dar_json_doc *doc;
         s = dar_json_parse(&doc, "made", good.text, good.size, e);
         if (s == DAR_OK) dar_json_write_value(&w, "made", dar_json_root(doc));
         dar_json_close(s == DAR_OK ? doc : NULL);
-        dar_quality_print(&a.quality, &w, "quality");
+        dar_quality_print(&a->quality, &w, "quality");
         dar_json_write_end(&w);
     }
     if (s == DAR_OK) s = finish(making, path, &w, e);
     dar_json_writer_free(&good);
     dar_json_writer_free(&w);
     return s;
+}
+
+/* ---------------------------------------------------------------- all bundles */
+
+static void note(struct job *j, const struct times *x, dar_status s, const dar_err *e)
+{
+    pthread_mutex_lock(&j->lock);
+    if (s == DAR_OK) {
+        j->sum.make += x->make;
+        j->sum.check += x->check;
+        for (int i = 0; i < DAR_RENDER_STAGES; i++) j->sum.render[i] += x->render[i];
+        dar_progress_step(&j->progress, (double)++j->made, NULL);
+    } else if (j->status == DAR_OK) {
+        j->status = s;
+        *j->e = *e;
+    }
+    pthread_mutex_unlock(&j->lock);
+}
+
+static bool goes_on(struct job *j)
+{
+    pthread_mutex_lock(&j->lock);
+    bool good = j->status == DAR_OK;
+    pthread_mutex_unlock(&j->lock);
+    return good && !dar_interrupted();
+}
+
+static void make_task(void *ctx, size_t i, int thread)
+{
+    struct job *j = ctx;
+    struct attempt a = { 0 };
+    dar_err e;
+    (void)thread;
+    if (!goes_on(j)) return;
+    dar_status s = make_one(j, j->missing[i], &a, &e);
+    note(j, &a.times, s, &e);
+}
+
+/* With fewer bundles than threads all threads make one. */
+static dar_status make_all(struct job *j, dar_err *e)
+{
+    char path[PATH_MAX];
+    snprintf(path, sizeof path, "%s/" MAKING, o.out);
+    DAR_TRY(dar_dir_create(&j->making, path, e));
+    j->e = e;
+    j->progress = dar_progress_begin("synth", "bundles", (double)j->todo);
+    if (j->todo >= (size_t)dar_threads()) dar_parallel(j->todo, make_task, j);
+    else
+        for (size_t i = 0; i < j->todo; i++) make_task(j, i, 0);
+    if (dar_interrupted())
+        return dar_fail(e, DAR_ERR_INTERRUPTED, "%s: interrupted after %zu of %zu bundles; the same command goes on",
+                        o.out, j->count - j->todo + j->made, j->count);
+    if (j->status == DAR_OK) dar_progress_end(&j->progress);
+    return j->status;
+}
+
+/* A bundle that is there must be the one that would be made. */
+static dar_status check_found(const struct job *j, size_t index, const char *path, dar_err *e)
+{
+    char file[PATH_MAX + 16];
+    dar_synth_plan p = j->plan;
+    dar_json_doc *doc;
+    snprintf(file, sizeof file, "%s/meta.json", path);
+    DAR_TRY(dar_json_open(&doc, file, e));
+    dar_json root = dar_json_root(doc), qc = dar_json_object(root, "qc");
+    dar_synth_set_plan(j->set, o.common.seed, index, dar_json_size(dar_json_array(qc, "rejected")), o.family, &p);
+    uint64_t seed = (uint64_t)dar_json_int(root, "seed", -1, 0, DAR_BUNDLE_MAX_SEED);
+    int64_t width = dar_json_int(root, "width", 0, 0, INT32_MAX),
+            height = dar_json_int(root, "height", 0, 0, INT32_MAX),
+            frames = dar_json_int(root, "frames", 0, 0, INT32_MAX);
+    double fps = dar_json_number(root, "fps", 0, 0, INFINITY);
+    const char *kind = dar_json_text(dar_json_object(qc, "made"), "kind", "");
+    bool same = seed == p.seed && width == p.width && height == p.height && frames == (int64_t)p.frames &&
+                fps == p.fps && (!p.subject || strcmp(kind, p.subject->name) == 0);
+    dar_json_close(doc);
+    if (same) return DAR_OK;
+    return dar_fail(e, DAR_ERR_USAGE,
+                    "%s: found a bundle of another set, seed, family or size, expected what this command makes", path);
+}
+
+static dar_status find_missing(struct job *j, dar_err *e)
+{
+    char path[PATH_MAX];
+    j->missing = calloc(j->count, sizeof *j->missing);
+    if (!j->missing) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory for %zu bundles", o.out, j->count);
+    for (size_t i = 0; i < j->count; i++) {
+        name_of(path, i);
+        if (is_there(path)) DAR_TRY(check_found(j, i, path, e));
+        else j->missing[j->todo++] = i;
+    }
+    return DAR_OK;
 }
 
 /* ---------------------------------------------------------------- the manifest */
@@ -348,72 +457,63 @@ static dar_status prepare(struct job *j, const dar_run *r, dar_err *e)
     j->plan.width = (int)o.size[0], j->plan.height = (int)o.size[1];
     j->plan.frames = (size_t)o.frames;
     j->plan.fps = o.fps;
-    if (mkdir(o.out, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", o.out, strerror(errno));
-    return DAR_OK;
-}
-
-static dar_status make_all(struct job *j, dar_err *e)
-{
-    char path[PATH_MAX];
-    dar_progress p = dar_progress_begin("synth", "bundles", (double)j->count);
-    for (size_t i = 0; i < j->count; i++) {
-        name_of(path, i);
-        if (is_there(path)) j->found++;
-        else {
-            DAR_TRY(make_one(j, i, path, e));
-            j->made++;
-        }
-        dar_progress_step(&p, (double)i + 1, NULL);
-        if (dar_interrupted())
-            return dar_fail(e, DAR_ERR_INTERRUPTED,
-                            "%s: interrupted after %zu of %zu bundles; the same command goes on", o.out, i + 1,
-                            j->count);
-    }
-    dar_progress_end(&p);
     return DAR_OK;
 }
 
 static void tell(const struct job *j, const struct manifest *m, dar_run *r, double seconds)
 {
+    const struct times *x = &j->sum;
     double each = j->made ? 1.0 / (double)j->made : 0;
     dar_run_say(r, "%s: %zu bundles of %d x %d, %zu frames: %zu made, %zu were there, %lld scenes rejected, %.1f s",
-                o.out, j->count, j->plan.width, j->plan.height, j->plan.frames, j->made, j->found,
+                o.out, j->count, j->plan.width, j->plan.height, j->plan.frames, j->made, j->count - j->made,
                 (long long)m->rejected, seconds);
     dar_json_write_text(&r->json, "set", j->set->name);
     dar_json_write_int(&r->json, "bundles", (int64_t)j->count);
     dar_json_write_int(&r->json, "made", (int64_t)j->made);
     dar_json_write_int(&r->json, "rejected", m->rejected);
     if (!j->made) return;
-    const double *s = j->sum.seconds;
-    dar_run_say(r, "each: %.3f s; make %.3f, draw %.3f, tracks %.3f, shade %.3f, write %.3f, check %.3f",
-                seconds * each, j->making * each, s[DAR_RENDER_DRAW] * each, s[DAR_RENDER_TRACKS] * each,
-                s[DAR_RENDER_PICTURE] * each, s[DAR_RENDER_WRITE] * each, j->checking * each);
+    dar_run_say(r, "each: %.3f s; of one thread: make %.3f, draw %.3f, tracks %.3f, shade %.3f, write %.3f, check %.3f",
+                seconds * each, x->make * each, x->render[DAR_RENDER_DRAW] * each, x->render[DAR_RENDER_TRACKS] * each,
+                x->render[DAR_RENDER_PICTURE] * each, x->render[DAR_RENDER_WRITE] * each, x->check * each);
     dar_json_write_object(&r->json, "seconds");
     dar_json_write_number(&r->json, "all", seconds);
-    dar_json_write_number(&r->json, "make", j->making);
-    for (int i = 0; i < DAR_RENDER_STAGES; i++) dar_json_write_number(&r->json, dar_render_stage_name[i], s[i]);
-    dar_json_write_number(&r->json, "check", j->checking);
+    dar_json_write_number(&r->json, "make", x->make);
+    for (int i = 0; i < DAR_RENDER_STAGES; i++) dar_json_write_number(&r->json, dar_render_stage_name[i], x->render[i]);
+    dar_json_write_number(&r->json, "check", x->check);
     dar_json_write_end(&r->json);
+}
+
+static dar_status fill(struct job *j, dar_run *r, dar_err *e)
+{
+    struct manifest *m = calloc(1, sizeof *m);
+    double begun = dar_log_clock();
+    if (!m) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", r->program->name);
+    dar_status s = find_missing(j, e);
+    if (s == DAR_OK) s = make_all(j, e);
+    dar_dir_discard(&j->making);
+    double seconds = dar_log_clock() - begun;
+    if (s == DAR_OK) s = write_manifest(j, m, e);
+    if (s == DAR_OK && o.sheet) s = draw_sheet(j, e);
+    if (s == DAR_OK) tell(j, m, r, seconds);
+    dar_json_writer_free(&m->w);
+    free(m);
+    return s;
 }
 
 static dar_status synth(dar_run *r, dar_err *e)
 {
-    struct job j = { 0 };
-    struct manifest *m = calloc(1, sizeof *m);
-    double begun = dar_log_clock();
-    if (!m) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", r->program->name);
-    dar_status s = prepare(&j, r, e);
-    if (s == DAR_OK && o.common.dry_run) {
+    struct job j = { .lock = PTHREAD_MUTEX_INITIALIZER };
+    int lock;
+    DAR_TRY(prepare(&j, r, e));
+    if (o.common.dry_run) {
         dar_run_say(r, "%s: %zu bundles of the set %s", o.out, j.count, j.set->name);
-    } else if (s == DAR_OK) {
-        s = make_all(&j, e);
-        double seconds = dar_log_clock() - begun;
-        if (s == DAR_OK) s = write_manifest(&j, m, e);
-        if (s == DAR_OK && o.sheet) s = draw_sheet(&j, e);
-        if (s == DAR_OK) tell(&j, m, r, seconds);
+        return DAR_OK;
     }
-    dar_json_writer_free(&m->w);
-    free(m);
+    if (mkdir(o.out, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", o.out, strerror(errno));
+    DAR_TRY(dar_dir_lock(&lock, o.out, e));
+    dar_status s = fill(&j, r, e);
+    close(lock);
+    free(j.missing);
     return s;
 }
 

@@ -7,6 +7,7 @@
 #include <errno.h>
 #include <hdf5.h>
 #include <inttypes.h>
+#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -50,16 +51,27 @@ static hid_t stored_type(dar_h5_type type)
     }
 }
 
-/* ---------------------------------------------------------------- errors */
+/* ---------------------------------------------------------------- one thread at a time */
 
-/* HDF5 keeps this per thread, so every entry says it again.  At exit it would visit files that it could not close, a
- * full disk for example, and crash: it is not asked to tidy up there. */
-static void silence(void)
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+
+/* The library is not re-entrant on every system.  Its silence may be kept per thread, so every entry says it again.  At
+ * exit it would visit files that it could not close, a full disk for example, and crash: it is not asked to tidy up
+ * there. */
+static void enter(void)
 {
+    pthread_mutex_lock(&lock);
     H5dont_atexit();
     H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
     H5Eclear2(H5E_DEFAULT);
 }
+
+static void leave(void)
+{
+    pthread_mutex_unlock(&lock);
+}
+
+/* ---------------------------------------------------------------- errors */
 
 struct cause {
     char text[160];
@@ -97,8 +109,15 @@ static dar_status allocate(dar_h5 **out, const char *path, bool writing, dar_err
     f->id = H5I_INVALID_HID;
     f->writing = writing;
     snprintf(f->path, sizeof f->path, "%s", path);
-    silence();
     return DAR_OK;
+}
+
+/* Without locks on files: a child that another thread starts meanwhile would inherit one and keep it. */
+static hid_t access_list(void)
+{
+    hid_t p = H5Pcreate(H5P_FILE_ACCESS);
+    if (p >= 0) H5Pset_file_locking(p, false, true);
+    return p;
 }
 
 static dar_status finish_open(dar_h5 **out, dar_status s)
@@ -115,8 +134,12 @@ dar_status dar_h5_create(dar_h5 **out, const char *path, dar_err *e)
     dar_status s = allocate(out, path, true, e);
     if (s == DAR_OK) s = dar_file_create(&(*out)->out, path, e);
     if (s == DAR_OK) {
-        (*out)->id = H5Fcreate((*out)->out.temp, H5F_ACC_TRUNC, H5P_DEFAULT, H5P_DEFAULT);
+        enter();
+        hid_t p = access_list();
+        (*out)->id = H5Fcreate((*out)->out.temp, H5F_ACC_TRUNC, H5P_DEFAULT, p);
         if ((*out)->id < 0) s = refused(*out, "", "cannot create", e);
+        if (p >= 0) H5Pclose(p);
+        leave();
     }
     return finish_open(out, s);
 }
@@ -124,11 +147,11 @@ dar_status dar_h5_create(dar_h5 **out, const char *path, dar_err *e)
 dar_status dar_h5_commit(dar_h5 *f, dar_err *e)
 {
     DAR_ASSERT(f->writing && f->id >= 0, "%s: not open for writing", f->path);
-    silence();
-    bool closed = H5Fclose(f->id) >= 0;
+    enter();
+    dar_status s = H5Fclose(f->id) < 0 ? refused(f, "", "cannot finish", e) : DAR_OK;
     f->id = H5I_INVALID_HID;
-    if (!closed) return refused(f, "", "cannot finish", e);
-    return dar_file_commit(&f->out, e);
+    leave();
+    return s == DAR_OK ? dar_file_commit(&f->out, e) : s;
 }
 
 dar_status dar_h5_open(dar_h5 **out, const char *path, dar_err *e)
@@ -140,8 +163,12 @@ dar_status dar_h5_open(dar_h5 **out, const char *path, dar_err *e)
 
     dar_status s = allocate(out, path, false, e);
     if (s == DAR_OK) {
-        (*out)->id = H5Fopen(path, H5F_ACC_RDONLY, H5P_DEFAULT);
+        enter();
+        hid_t p = access_list();
+        (*out)->id = H5Fopen(path, H5F_ACC_RDONLY, p);
         if ((*out)->id < 0) s = refused(*out, "", "cannot open", e);
+        if (p >= 0) H5Pclose(p);
+        leave();
     }
     return finish_open(out, s);
 }
@@ -149,8 +176,9 @@ dar_status dar_h5_open(dar_h5 **out, const char *path, dar_err *e)
 void dar_h5_close(dar_h5 *f)
 {
     if (!f) return;
-    silence();
+    enter();
     if (f->id >= 0) H5Fclose(f->id);
+    leave();
     dar_file_discard(&f->out);
     free(f->scratch);
     free(f);
@@ -191,7 +219,7 @@ dar_status dar_h5_make(dar_h5 *f, const char *name, const dar_h5_array *a, dar_e
 {
     check_array(name, a);
     for (int i = 0; i < a->rank; i++) DAR_ASSERT(a->dim[i] > 0, "%s: dimension %d is 0", name, i);
-    silence();
+    enter();
     hid_t space = space_of(a, a->dim[0]), p = creation(a), links = H5Pcreate(H5P_LINK_CREATE), set = H5I_INVALID_HID;
     if (space >= 0 && p >= 0 && links >= 0 && H5Pset_create_intermediate_group(links, 1) >= 0)
         set = H5Dcreate2(f->id, name, stored_type(a->type), space, links, p, H5P_DEFAULT);
@@ -200,20 +228,28 @@ dar_status dar_h5_make(dar_h5 *f, const char *name, const dar_h5_array *a, dar_e
     if (links >= 0) H5Pclose(links);
     if (p >= 0) H5Pclose(p);
     if (space >= 0) H5Sclose(space);
+    leave();
     return s;
 }
 
 /* Every group on the way must be there before HDF5 can be asked for the last one. */
-bool dar_h5_has(dar_h5 *f, const char *name)
+static bool has(dar_h5 *f, const char *name)
 {
     char part[256];
-    silence();
     for (const char *p = name;; p++) {
         if (*p && *p != '/') continue;
         int n = snprintf(part, sizeof part, "%.*s", (int)(p - name), name);
         if (n >= (int)sizeof part || H5Lexists(f->id, part, H5P_DEFAULT) <= 0) return false;
         if (!*p) return true;
     }
+}
+
+bool dar_h5_has(dar_h5 *f, const char *name)
+{
+    enter();
+    bool there = has(f, name);
+    leave();
+    return there;
 }
 
 /* How a dataset lies in the file. */
@@ -289,13 +325,11 @@ static dar_status compare(const dar_h5 *f, const char *name, dar_h5_array *a, hi
     return DAR_OK;
 }
 
-dar_status dar_h5_expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *e)
+static dar_status expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *e)
 {
     dar_status s = DAR_OK;
     struct storage in;
-    check_array(name, a);
-    silence();
-    if (!dar_h5_has(f, name)) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found nothing of this name", f->path, name);
+    if (!has(f, name)) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found nothing of this name", f->path, name);
     hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT);
     if (set < 0) return refused(f, name, "cannot open", e);
     hid_t type = H5Dget_type(set), space = H5Dget_space(set), p = H5Dget_create_plist(set);
@@ -316,6 +350,15 @@ dar_status dar_h5_expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *
     if (space >= 0) H5Sclose(space);
     if (type >= 0) H5Tclose(type);
     H5Dclose(set);
+    return s;
+}
+
+dar_status dar_h5_expect(dar_h5 *f, const char *name, dar_h5_array *a, dar_err *e)
+{
+    check_array(name, a);
+    enter();
+    dar_status s = expect(f, name, a, e);
+    leave();
     return s;
 }
 
@@ -350,11 +393,13 @@ static dar_status read_chunk(dar_h5 *f, const char *name, hid_t set, const struc
     bool shuffled = s->shuffle && !(mask & 1), deflated = s->deflate && !(mask >> s->shuffle & 1);
     if (deflated ? size > packed_bound(s->bytes) : size != s->bytes) return broken(f, name, at, e);
     if (H5Dread_chunk(set, H5P_DEFAULT, at, &again, packed) < 0) return refused(f, name, "cannot read", e);
+    leave(); /* most of the time goes here */
+    bool whole = !deflated || dar_inflate(packed, size, plain, s->bytes);
     if (!deflated) plain = packed;
-    else if (!dar_inflate(packed, size, plain, s->bytes)) return broken(f, name, at, e);
-    if (shuffled) dar_unshuffle(plain, s->bytes, s->element, last);
+    if (whole && shuffled) dar_unshuffle(plain, s->bytes, s->element, last);
+    enter();
     *out = shuffled ? last : plain;
-    return DAR_OK;
+    return whole ? DAR_OK : broken(f, name, at, e);
 }
 
 /* Where a chunk and the rows that are wanted meet, innermost dimension first: indices, and their steps in bytes. */
@@ -426,7 +471,7 @@ static dar_status transfer(dar_h5 *f, const char *name, const dar_h5_array *a, u
     DAR_ASSERT(count > 0 && first < a->dim[0] && count <= a->dim[0] - first,
                "%s: %" PRIu64 " from %" PRIu64 " of %" PRIu64, name, count, first, a->dim[0]);
     for (int i = 0; i < a->rank; i++) n[i] = i ? a->dim[i] : count;
-    silence();
+    enter();
     hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT), p = set < 0 ? set : H5Dget_create_plist(set),
           memory = space_of(a, count), space = set < 0 ? set : H5Dget_space(set);
     struct storage in = { 0 };
@@ -443,6 +488,7 @@ static dar_status transfer(dar_h5 *f, const char *name, const dar_h5_array *a, u
     if (memory >= 0) H5Sclose(memory);
     if (p >= 0) H5Pclose(p);
     if (set >= 0) H5Dclose(set);
+    leave();
     return s;
 }
 
@@ -464,11 +510,12 @@ dar_status dar_h5_write_chunk(dar_h5 *f, const char *name, const dar_h5_array *a
     const hsize_t at[DAR_H5_RANK] = { index };
     check_array(name, a);
     DAR_ASSERT(a->chunk <= 1 && index < a->dim[0], "%s: chunk %" PRIu64 " of %" PRIu64, name, index, a->dim[0]);
-    silence();
+    enter();
     hid_t set = H5Dopen2(f->id, name, H5P_DEFAULT);
     bool done = set >= 0 && H5Dwrite_chunk(set, H5P_DEFAULT, 0, at, size, data) >= 0;
     dar_status s = done ? DAR_OK : refused(f, name, "cannot write", e);
     if (set >= 0) H5Dclose(set);
+    leave();
     return s;
 }
 
@@ -477,7 +524,6 @@ dar_status dar_h5_write_chunk(dar_h5 *f, const char *name, const dar_h5_array *a
 static dar_status put(dar_h5 *f, const char *name, const char *key, hid_t type, hid_t space, const void *data,
                       dar_err *e)
 {
-    silence();
     hid_t a = H5Acreate_by_name(f->id, name, key, type, space, H5P_DEFAULT, H5P_DEFAULT, H5P_DEFAULT);
     dar_status s = a < 0 || H5Awrite(a, type, data) < 0 ? refused(f, name, key, e) : DAR_OK;
     if (a >= 0) H5Aclose(a);
@@ -488,7 +534,11 @@ static dar_status put(dar_h5 *f, const char *name, const char *key, hid_t type, 
 dar_status dar_h5_put_numbers(dar_h5 *f, const char *name, const char *key, const double *x, size_t n, dar_err *e)
 {
     hsize_t dim = n;
-    return put(f, name, key, H5T_IEEE_F64LE, n == 1 ? H5Screate(H5S_SCALAR) : H5Screate_simple(1, &dim, NULL), x, e);
+    enter();
+    hid_t space = n == 1 ? H5Screate(H5S_SCALAR) : H5Screate_simple(1, &dim, NULL);
+    dar_status s = put(f, name, key, H5T_IEEE_F64LE, space, x, e);
+    leave();
+    return s;
 }
 
 static hid_t text_type(size_t size)
@@ -501,16 +551,17 @@ static hid_t text_type(size_t size)
 
 dar_status dar_h5_put_text(dar_h5 *f, const char *name, const char *key, const char *text, dar_err *e)
 {
+    enter();
     hid_t type = text_type(strlen(text) + 1);
     dar_status s = put(f, name, key, type, H5Screate(H5S_SCALAR), text, e);
     H5Tclose(type);
+    leave();
     return s;
 }
 
 /* Open an attribute of n elements of a class. */
 static dar_status get(hid_t *a, dar_h5 *f, const char *name, const char *key, H5T_class_t class, size_t n, dar_err *e)
 {
-    silence();
     *a = H5Aopen_by_name(f->id, name, key, H5P_DEFAULT, H5P_DEFAULT);
     if (*a < 0) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: attribute %s is missing", f->path, name, key);
     hid_t type = H5Aget_type(*a), space = H5Aget_space(*a);
@@ -528,26 +579,39 @@ static dar_status get(hid_t *a, dar_h5 *f, const char *name, const char *key, H5
 dar_status dar_h5_get_numbers(dar_h5 *f, const char *name, const char *key, double *x, size_t n, dar_err *e)
 {
     hid_t a;
-    DAR_TRY(get(&a, f, name, key, H5T_FLOAT, n, e));
-    dar_status s = H5Aread(a, H5T_NATIVE_DOUBLE, x) < 0 ? refused(f, name, key, e) : DAR_OK;
-    H5Aclose(a);
+    enter();
+    dar_status s = get(&a, f, name, key, H5T_FLOAT, n, e);
+    if (s == DAR_OK) {
+        if (H5Aread(a, H5T_NATIVE_DOUBLE, x) < 0) s = refused(f, name, key, e);
+        H5Aclose(a);
+    }
+    leave();
+    return s;
+}
+
+static dar_status read_text(hid_t a, const dar_h5 *f, const char *name, const char *key, char *text, size_t size,
+                            dar_err *e)
+{
+    dar_status s = DAR_OK;
+    if (H5Aget_storage_size(a) > size)
+        return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: attribute %s: text of %" PRIuHSIZE " bytes, expected at most %zu",
+                        f->path, name, key, H5Aget_storage_size(a), size);
+    hid_t type = text_type(size);
+    if (H5Aread(a, type, text) < 0) s = refused(f, name, key, e);
+    else text[size - 1] = 0;
+    H5Tclose(type);
     return s;
 }
 
 dar_status dar_h5_get_text(dar_h5 *f, const char *name, const char *key, char *text, size_t size, dar_err *e)
 {
     hid_t a;
-    DAR_TRY(get(&a, f, name, key, H5T_STRING, 1, e));
-    dar_status s = DAR_OK;
-    if (H5Aget_storage_size(a) > size) {
-        s = dar_fail(e, DAR_ERR_FORMAT, "%s: %s: attribute %s: text of %" PRIuHSIZE " bytes, expected at most %zu",
-                     f->path, name, key, H5Aget_storage_size(a), size);
-    } else {
-        hid_t type = text_type(size);
-        if (H5Aread(a, type, text) < 0) s = refused(f, name, key, e);
-        else text[size - 1] = 0;
-        H5Tclose(type);
+    enter();
+    dar_status s = get(&a, f, name, key, H5T_STRING, 1, e);
+    if (s == DAR_OK) {
+        s = read_text(a, f, name, key, text, size, e);
+        H5Aclose(a);
     }
-    H5Aclose(a);
+    leave();
     return s;
 }

@@ -1,8 +1,9 @@
 /* h5.h: HDF5 files of plain arrays, through the serial HDF5 library: read and written some leading indices at a time.
  *
- * HDF5 is not re-entrant on every system: a program calls these functions from one thread at a time.  The type in
- * memory is the type in the file; nothing is converted.  Names of datasets are paths inside the file, without a leading
- * slash: "tracking", "sparse_tracking/xy". */
+ * A file is used by one thread at a time.  Threads with files of their own wait for each other, but where chunks are
+ * unpacked, since HDF5 is not re-entrant on every system.  The type in memory is the type in the file; nothing is
+ * converted.  Names of datasets are paths inside the file, without a leading slash: "tracking", "sparse_tracking/xy".
+ */
 #ifndef DAR_DATA_H5_H
 #define DAR_DATA_H5_H
 

@@ -11,6 +11,12 @@ static uint64_t seed_of(uint64_t seed, const char *purpose, uint64_t number)
     return dar_rng_u64(seed, dar_rng_stream(purpose), number) & DAR_BUNDLE_MAX_SEED;
 }
 
+/* The seed of a set for another attempt. */
+static uint64_t again(uint64_t seed, size_t attempt)
+{
+    return attempt ? seed_of(seed, "attempt", attempt) : seed;
+}
+
 /* The n-th kind of a set. */
 static const dar_asset_kind *kind_of(dar_asset_set set, size_t n)
 {
@@ -39,29 +45,28 @@ static const dar_trajectory_kind *path_of(const char *family, dar_dice *d)
 
 static const char *const benchmark[] = { "dolly-15", "orbit-30", "orbit-60", "orbit-0-45" };
 
-static void plan_train(uint64_t seed, size_t row, size_t column, dar_synth_plan *p)
+static void plan_train(const dar_synth_cell *c, dar_synth_plan *p)
 {
-    (void)column;
-    p->seed = p->look = p->view = seed_of(seed, "train", row);
+    p->seed = p->look = p->view = seed_of(c->own, "train", c->row);
 }
 
-static void plan_vis(uint64_t seed, size_t row, size_t column, dar_synth_plan *p)
+static void plan_vis(const dar_synth_cell *c, dar_synth_plan *p)
 {
-    p->seed = p->look = p->view = seed_of(seed, "4d_vis", row);
+    p->seed = p->look = p->view = seed_of(c->own, "4d_vis", c->row); /* its paths leave nothing to be drawn */
     p->set = DAR_ASSET_VIS;
-    p->subject = kind_of(DAR_ASSET_VIS, row);
-    p->alone = row % 2 == 0;
-    p->path = path_named(benchmark[column]);
+    p->subject = kind_of(DAR_ASSET_VIS, c->row);
+    p->alone = c->row % 2 == 0;
+    p->path = path_named(benchmark[c->column]);
 }
 
-static void plan_ood(uint64_t seed, size_t row, size_t column, dar_synth_plan *p)
+static void plan_ood(const dar_synth_cell *c, dar_synth_plan *p)
 {
-    dar_dice d = dar_dice_for(seed, "ood34 path", 2 * row + column);
-    p->seed = p->look = seed_of(seed, "ood34", row);
-    p->view = seed_of(seed, "ood34 view", 2 * row + column);
+    dar_dice d = dar_dice_for(c->own, "ood34 path", 2 * c->row + c->column);
+    p->seed = p->look = seed_of(c->shared, "ood34", c->row);
+    p->view = seed_of(c->own, "ood34 view", 2 * c->row + c->column);
     p->set = DAR_ASSET_OOD;
-    p->subject = kind_of(DAR_ASSET_OOD, row);
-    p->path = path_of(column ? "unreal" : "blender", &d);
+    p->subject = kind_of(DAR_ASSET_OOD, c->row);
+    p->path = path_of(c->column ? "unreal" : "blender", &d);
 }
 
 static const dar_asset_kind *kind_named(const char *name)
@@ -72,38 +77,36 @@ static const dar_asset_kind *kind_named(const char *name)
     return NULL;
 }
 
-static void plan_refvar(uint64_t seed, size_t row, size_t column, dar_synth_plan *p)
+static void plan_refvar(const dar_synth_cell *c, dar_synth_plan *p)
 {
-    (void)column;
-    p->seed = p->view = seed_of(seed, "refvar", 0);
-    p->look = seed_of(seed, "refvar look", row);
+    p->seed = p->view = seed_of(c->shared, "refvar", 0);
+    p->look = seed_of(c->own, "refvar look", c->row);
     p->set = DAR_ASSET_VIS;
     p->subject = kind_named("racer");
     p->alone = true;
     p->path = path_named("orbit-30");
 }
 
-static void plan_separation(uint64_t seed, size_t row, size_t column, dar_synth_plan *p)
+static void plan_separation(const dar_synth_cell *c, dar_synth_plan *p)
 {
     static const char *const path[] = { "orbit-30", "orbit-60", "dolly-in", "vertical-arc-up", "ue-oblique-orbit" };
     static const char *const subject[] = { "dancer", "cat", "racer", "ferris wheel", "twisting tower" };
-    p->seed = p->look = seed_of(seed, "separation", row);
-    p->view = seed_of(seed, "separation view", column);
+    p->seed = p->look = seed_of(c->shared, "separation", c->row);
+    p->view = seed_of(c->own, "separation view", c->column);
     p->set = DAR_ASSET_VIS;
-    p->subject = kind_named(subject[row]);
-    p->path = path_named(path[column]);
+    p->subject = kind_named(subject[c->row]);
+    p->path = path_named(path[c->column]);
     p->alone = true;
     p->reach = 3;
 }
 
-static void plan_correspondence(uint64_t seed, size_t row, size_t column, dar_synth_plan *p)
+static void plan_correspondence(const dar_synth_cell *c, dar_synth_plan *p)
 {
     static const char *const path[] = { "half-orbit", "ue-orbit-half", "low-arc-half", "full-orbit" };
-    (void)column;
-    p->seed = p->look = p->view = seed_of(seed, "correspondence", row);
+    p->seed = p->look = p->view = seed_of(c->own, "correspondence", c->row);
     p->set = DAR_ASSET_VIS;
-    p->subject = kind_of(DAR_ASSET_VIS, row);
-    p->path = path_named(path[row % 4]);
+    p->subject = kind_of(DAR_ASSET_VIS, c->row);
+    p->path = path_named(path[c->row % 4]);
 }
 
 const dar_synth_set dar_synth_sets[] = {
@@ -128,12 +131,13 @@ void dar_synth_set_plan(const dar_synth_set *set, uint64_t seed, size_t index, s
                         dar_synth_plan *p)
 {
     size_t columns = set->columns ? set->columns : 1;
-    if (attempt) seed = seed_of(seed, "attempt", attempt);
+    const dar_synth_cell cell = { again(seed, attempt / DAR_SYNTH_OWN * DAR_SYNTH_OWN), again(seed, attempt),
+                                  index / columns, index % columns };
     p->set = DAR_ASSET_TRAIN;
     p->subject = NULL, p->path = NULL;
     p->reach = 0;
     p->alone = false;
-    set->plan(seed, index / columns, index % columns, p);
+    set->plan(&cell, p);
     if (!family || p->subject) return;
     dar_dice d = dar_dice_for(p->seed, "subject", 0);
     do {

@@ -16,16 +16,26 @@
 
 #include "data/synth.h"
 
+#define DAR_SYNTH_OWN 4 /* attempts that leave alone what a bundle shares with others */
+
+/* Place of a bundle in its set, and the seeds of what it shares with others there and of what is its own. */
+typedef struct dar_synth_cell {
+    uint64_t shared, own;
+    size_t row, column;
+} dar_synth_cell;
+
 typedef struct dar_synth_set {
     const char *name, *help;
     size_t rows, columns; /* 0: any number of bundles */
-    void (*plan)(uint64_t seed, size_t row, size_t column, dar_synth_plan *plan);
+    void (*plan)(const dar_synth_cell *cell, dar_synth_plan *plan);
 } dar_synth_set;
 
 extern const dar_synth_set dar_synth_sets[];
 extern const char *const dar_synth_set_names[]; /* ends with NULL */
 
-/* Seeds, subject, path and reach of bundle `index`; the rest of the plan stays.  Another attempt is another scene.
+/* Seeds, subject, path and reach of bundle `index`; the rest of the plan stays.  Another attempt draws again what the
+ * bundle shares with no other: of refvar the paints and lights, of ood34 and motion-separation the camera path, else,
+ * and every DAR_SYNTH_OWN attempts, the scene.  Other bundles stay as they are.
  * family: of the subjects, NULL: any; only where the set draws them. */
 void dar_synth_set_plan(const dar_synth_set *set, uint64_t seed, size_t index, size_t attempt, const char *family,
                         dar_synth_plan *plan);

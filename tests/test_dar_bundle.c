@@ -459,9 +459,33 @@ static void synthetic(void **state)
     run_same_file("calm/manifest.json", "torn/manifest.json");
     assert_int_equal(count("torn", ""), 7);
     assert_int_equal(count("torn", ".making"), 0);
+    const char *const other[][3] = { { "--seed=4" }, { "--size=32x32" }, { "--frames=6" }, { "--set=refvar" } };
+    for (size_t i = 0; i < DAR_COUNT(other); i++) {
+        CHECK(RUN(SYNTH, "-o", "torn", other[i][0]) == 2, "%s: status %d", other[i][0], ran.status);
+        CHECK(run_one_line(ran.err) && strstr(ran.err, "torn/000000: found a bundle of another"), "%s", ran.err);
+    }
+    run_same_file("calm/manifest.json", "torn/manifest.json");
     assert_int_equal(RUN("synth", "-o", "x", "--set", "4d_vis", "--count", "69"), 2);
     assert_int_equal(RUN("synth", "-o", "x", "--family", "unicorn"), 2);
     CHECK(!run_is_there("x"), "a refused set has a directory");
+}
+
+/* While one process, stopped here, is at work in a directory, another leaves it alone. */
+static void two_at_once(void **state)
+{
+    (void)state;
+    pid_t pid = run_start(program, (const char *const[]){ SYNTH, "-o", "shared", "--threads", "2", NULL });
+    for (int i = 0; i < 4000 && !run_is_there("shared/000000"); i++)
+        nanosleep(&(struct timespec){ .tv_nsec = 2500000 }, NULL);
+    kill(pid, SIGSTOP);
+    int status = RUN(SYNTH, "-o", "shared");
+    bool told = run_one_line(ran.err) && strstr(ran.err, "shared: another program is writing there");
+    kill(pid, SIGCONT);
+    CHECK(status == 2 && told, "status %d: %s", status, ran.err);
+    assert_int_equal(run_finish(pid), 0);
+    assert_int_equal(count("shared", ""), 7);
+    GOOD(SYNTH, "-o", "shared", "--json");
+    assert_int_equal((int)printed(NULL, "made"), 0);
 }
 
 /* Files may not grow beyond 16 kB: as on a full disk, writing fails half way. */
@@ -512,6 +536,7 @@ int main(int argc, char **argv)
         cmocka_unit_test(killed),
         cmocka_unit_test(interrupted),
         cmocka_unit_test(synthetic),
+        cmocka_unit_test(two_at_once),
         cmocka_unit_test(full_disk),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-bundle")) return 2;

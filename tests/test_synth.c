@@ -68,7 +68,9 @@ static void check_path(const dar_synth *s, struct census *n)
 static void thousand_scenes(void **state)
 {
     struct census n = { 0 };
+    int threads = dar_threads();
     (void)state;
+    dar_threads_set(1); /* work this small would be waiting for other threads */
     for (uint64_t seed = 0; seed < SCENES; seed++) {
         dar_synth_plan p = plan_of(seed);
         dar_synth s;
@@ -78,6 +80,7 @@ static void thousand_scenes(void **state)
         check_path(&s, &n);
         dar_synth_free(&s);
     }
+    dar_threads_set(threads);
     CHECK(100 * n.seen >= 99 * n.frames, "the subject is in view in %zu of %zu frames", n.seen, n.frames);
     for (size_t i = 0; i < dar_trajectory_count; i++) {
         bool benchmark = strcmp(dar_trajectory_kinds[i].family, "benchmark") == 0;
@@ -239,6 +242,61 @@ static void motion_separates(void **state)
     CHECK(pairs > 20000 && 2 * deeper > pairs, "%zu pairs, %zu at other depths", pairs, deeper);
 }
 
+/* Another attempt at a bundle draws again what is its own, and nothing that it shares; at last the scene too. */
+static void attempts_stay_apart(void **state)
+{
+    static const struct {
+        const char *set;
+        bool seed, look, view; /* shared with others */
+    } rule[] = { { "train", false, false, false },
+                 { "4d_vis", false, false, false },
+                 { "ood34", true, true, false },
+                 { "refvar", true, false, true },
+                 { "motion-separation", true, true, false },
+                 { "correspondence", false, false, false } };
+    (void)state;
+    for (size_t i = 0; i < DAR_COUNT(rule); i++)
+        for (size_t index = 0; index < 10; index++) {
+            const dar_synth_set *set = set_named(rule[i].set);
+            dar_synth_plan first = item(set, index), p = first;
+            uint64_t view[DAR_SYNTH_OWN];
+            for (size_t n = 0; n < DAR_SYNTH_OWN; n++) {
+                dar_synth_set_plan(set, 5, index, n, NULL, &p);
+                view[n] = p.view + 3 * p.look;
+                for (size_t k = 0; k < n; k++) CHECK(view[k] != view[n], "%s: attempt %zu is not new", set->name, n);
+                if (n == 0) continue;
+                CHECK((p.seed == first.seed) == rule[i].seed && (p.look == first.look) == rule[i].look &&
+                          (p.view == first.view) == rule[i].view && p.subject == first.subject,
+                      "%s, bundle %zu, attempt %zu: what is shared changes, or what is its own stays", set->name, index,
+                      n);
+            }
+            dar_synth_set_plan(set, 5, index, DAR_SYNTH_OWN, NULL, &p);
+            CHECK(p.seed != first.seed, "%s, bundle %zu: the scene stays for ever", set->name, index);
+        }
+}
+
+/* Another camera of a rejected cell: other pictures of the same animation.  Paths of the benchmark, in the first two
+ * columns, leave nothing to be drawn. */
+static void rejected_cells_move_on(void **state)
+{
+    static const char *const name[] = { "motion-separation", "ood34" };
+    (void)state;
+    for (size_t i = 0; i < DAR_COUNT(name); i++) {
+        const dar_synth_set *set = set_named(name[i]);
+        for (size_t index = 2; index < 5; index++) {
+            dar_synth_plan p = item(set, index);
+            dar_synth first, s;
+            make(&first, &p);
+            dar_synth_set_plan(set, 5, index, 1, NULL, &p);
+            make(&s, &p);
+            CHECK(memcmp(s.box, first.box, T * sizeof *s.box) == 0, "%s: another animation", set->name);
+            CHECK(memcmp(s.cameras.view, first.cameras.view, T * sizeof *s.cameras.view) != 0,
+                  "%s, bundle %zu: the same camera again", set->name, index);
+            dar_synth_free(&first), dar_synth_free(&s);
+        }
+    }
+}
+
 /* Appearances differ, geometry does not. */
 static void looks_separate(void **state)
 {
@@ -312,9 +370,15 @@ static void shapes_face_outwards(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(shapes_face_outwards), cmocka_unit_test(thousand_scenes), cmocka_unit_test(same_bits),
-        cmocka_unit_test(kinds_are_apart),      cmocka_unit_test(sets_are_whole),  cmocka_unit_test(motion_separates),
+        cmocka_unit_test(shapes_face_outwards),
+        cmocka_unit_test(thousand_scenes),
+        cmocka_unit_test(same_bits),
+        cmocka_unit_test(kinds_are_apart),
+        cmocka_unit_test(sets_are_whole),
+        cmocka_unit_test(motion_separates),
         cmocka_unit_test(looks_separate),
+        cmocka_unit_test(attempts_stay_apart),
+        cmocka_unit_test(rejected_cells_move_on),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
