@@ -20,10 +20,11 @@ static struct {
     int64_t steps;
     double guidance, shift, strength;
     int solver, grid, precision, skip;
+    int64_t window, overlap;
     dar_arg_list references, no_skip;
     bool no_png, no_mp4, no_sheet, mkv, overwrite;
     dar_common common;
-} o;
+} o = { .overlap = -1 };
 
 static const char *const precision_names[] = { "f64", "f32", "bf16", NULL }; /* dar_dtype */
 static const char *const skip_names[] = { "none", "exact", NULL };
@@ -80,7 +81,12 @@ static const dar_option options[] = {
     { .name = "skip", .placeholder = "WHICH", .type = DAR_ARG_CHOICE, .target = &o.skip, .standard = "exact",
       .names = skip_names, .help = "work that need not be done: exact: all that changes nothing; none" },
     { .name = "no-skip", .placeholder = "NAME", .type = DAR_ARG_LIST, .target = &o.no_skip,
-      .help = "all but pass, scene, text, times, padding, lora or repeat (models/sampler.h)" },
+      .help = "all but pass, scene, text, times, padding, begin, held, lora or repeat (models/sampler.h)" },
+    { .name = "window", .placeholder = "T", .type = DAR_ARG_INT, .target = &o.window, .standard = "0", .lo = 0,
+      .hi = 100001, .help = "clips of more frames than the model was trained for: through windows of T frames, 4 n + 1, "
+      "each with the first frame; 0: all at once" },
+    { .name = "overlap", .placeholder = "T", .type = DAR_ARG_INT, .target = &o.overlap, .lo = 0, .hi = 100000,
+      .help = "frames that neighbouring windows share, 4 n (default: a quarter of a window)" },
 
     { .help = "Files" },
     { .name = "no-png", .type = DAR_ARG_FLAG, .target = &o.no_png, .help = "no frames/00000.png ..." },
@@ -110,11 +116,25 @@ static dar_status read_skips(unsigned *skips, dar_err *e)
         while (k < DAR_SKIPS && strcmp(dar_skip_name[k], o.no_skip.at[i]) != 0) k++;
         if (k == DAR_SKIPS)
             return dar_fail(e, DAR_ERR_USAGE,
-                            "--no-skip: found '%s', expected pass, scene, text, times, padding, lora or repeat",
+                            "--no-skip: found '%s', expected pass, scene, text, times, padding, begin, held, "
+                            "lora or repeat",
                             o.no_skip.at[i]);
         *skips &= ~(1u << k);
     }
     return DAR_OK;
+}
+
+/* In latent frames. */
+static dar_status read_window(dar_pipeline_options *p, dar_err *e)
+{
+    if (o.window == 0) return DAR_OK;
+    if (o.window < 9 || o.window % DAR_RAYS_GROUP != 1)
+        return dar_fail(e, DAR_ERR_USAGE, "--window: found %lld, expected 9, 13, 17, ... frames", (long long)o.window);
+    p->window = (o.window - 1) / DAR_RAYS_GROUP + 1;
+    p->overlap = o.overlap < 0 ? p->window / 4 : o.overlap / DAR_RAYS_GROUP;
+    if (o.overlap < 0 || (o.overlap % DAR_RAYS_GROUP == 0 && p->overlap < p->window - 1)) return DAR_OK;
+    return dar_fail(e, DAR_ERR_USAGE, "--overlap: found %lld, expected 0, 4, 8, ... up to %lld frames",
+                    (long long)o.overlap, (long long)(o.window - 5));
 }
 
 static dar_status read_options(struct job *j, dar_err *e)
@@ -132,6 +152,7 @@ static dar_status read_options(struct job *j, dar_err *e)
     p->sampler.solver.shift = o.shift;
     if (strcmp(o.noise, "torch") == 0) p->noise = DAR_NOISE_TORCH;
     else if (strcmp(o.noise, "own") != 0) p->noise_file = o.noise;
+    DAR_TRY(read_window(p, e));
     return read_skips(&p->sampler.skip, e);
 }
 
@@ -250,6 +271,10 @@ static void print_sampler(dar_json_writer *w, const struct job *j)
         char seed[32]; /* any 64 bits, which a number of JSON does not hold */
         snprintf(seed, sizeof seed, "%llu", (unsigned long long)j->how.seed);
         dar_json_write_text(w, "seed", seed);
+    }
+    if (j->how.window) {
+        dar_json_write_int(w, "window", o.window);
+        dar_json_write_int(w, "overlap", DAR_RAYS_GROUP * j->how.overlap);
     }
     dar_json_write_array(w, "skips");
     for (int k = 0; k < DAR_SKIPS; k++)
@@ -409,7 +434,7 @@ static void tell_plan(struct job *j, const dar_pipeline *p, const char *bundle)
     dar_json_write_number(w, "decode", p->decode);
     dar_json_write_end(w);
     dar_json_write_object(w, "flops_saved");
-    for (int k = 0; k < DAR_SKIP_LORA; k++) dar_json_write_number(w, dar_skip_name[k], p->saved[k]);
+    for (int k = 0; k < DAR_SKIPS; k++) dar_json_write_number(w, dar_skip_name[k], p->saved[k]);
     dar_json_write_end(w);
     if (!o.common.dry_run) return;
     double seconds = (p->prepare + (double)videos * video) / dar_rate((dar_dtype)o.precision);
@@ -418,7 +443,7 @@ static void tell_plan(struct job *j, const dar_pipeline *p, const char *bundle)
                 bundle, videos, videos == 1 ? "" : "s", p->b->meta.frames, p->b->meta.width, p->b->meta.height,
                 1e-9 * (double)bytes, 1e-9 * (double)j->m->bytes, 1e-12 * (p->prepare + (double)videos * video),
                 dar_log_duration(seconds, time, sizeof time));
-    for (int k = 0; k < DAR_SKIP_LORA; k++)
+    for (int k = 0; k < DAR_SKIPS; k++)
         if (p->saved[k] > 0)
             dar_run_say(j->r, "  without skipping %s: %.3g TFLOP more for a video", dar_skip_name[k],
                         1e-12 * p->saved[k]);

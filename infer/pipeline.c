@@ -135,8 +135,10 @@ static dar_status prepare(dar_pipeline *p, const dar_condition_source *source, c
         dar_arena_reset(&p->step, mark);
         p->cond = dar_tensor_reshape(&p->cond, DAR_SHAPE(1, s.d[0], s.d[1], s.d[2], s.d[3]));
     }
-    dar_sampler_clip clip = { p->frames, p->height, p->width, p->cond, { p->words[0], p->words[1] } };
-    return dar_sampler_init(&p->sampler, &p->m->dit, c, &clip, &p->kept, &p->step, e);
+    dar_sampler_clip clip = { .frames = p->frames, .height = p->height, .width = p->width, .cond = p->cond };
+    clip.window = p->o.window, clip.overlap = p->o.overlap;
+    for (int i = 0; i < 2; i++) clip.text[i] = p->words[i];
+    return dar_sampler_init(&p->sampler, p->dit, c, &clip, &p->kept, &p->step, e);
 }
 
 static dar_status tell(const dar_pipeline_listener *l, dar_pipeline_stage stage, int64_t done, int64_t of, dar_err *e)
@@ -230,10 +232,11 @@ struct steps {
     const dar_pipeline_listener *l;
 };
 
-static dar_status step_done(void *ctx, size_t done, const dar_tensor *z, dar_err *e)
+static dar_status step_done(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e)
 {
     const struct steps *s = ctx;
     (void)z;
+    (void)clean;
     return tell(s->l, DAR_PIPELINE_SAMPLE, (int64_t)done, (int64_t)s->p->o.sampler.solver.steps, e);
 }
 
@@ -248,7 +251,9 @@ dar_status dar_pipeline_render(dar_pipeline *p, const uint8_t *reference, const 
     double before = p->tape.cost.forward;
 
     dar_status status = encode(p, reference, &latent, l, e);
-    p->encode = p->tape.cost.forward - before;
+    before = p->tape.cost.forward - before;
+    if (plans(p)) p->encode = before;
+    else p->saved[DAR_SKIP_REPEAT] = fmax(p->encode - before, 0);
     if (c->mask) {
         bool *seen = dar_arena_push(&p->kept, (size_t)(p->frames * c->mask));
         known = dar_tensor_push(&p->kept, main, DAR_SHAPE(1, c->mask + c->latent, p->frames, p->height, p->width));
@@ -295,19 +300,41 @@ static dar_status count(dar_pipeline *p, const dar_condition_source *source, uns
     return DAR_OK;
 }
 
-static dar_status plan(dar_pipeline *p, const dar_condition_source *source, size_t bytes[2], dar_err *e)
+/* The same for a network whose low-rank additions were not merged. */
+static dar_status count_apart(dar_pipeline *p, const dar_condition_source *source, double *flops, dar_err *e)
+{
+    const size_t layers = (size_t)p->m->c.dit.layers;
+    dar_dit dit = p->m->dit;
+    if (!(dit.block = malloc(layers * sizeof *dit.block)))
+        return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", p->path);
+    memcpy(dit.block, p->m->dit.block, layers * sizeof *dit.block);
+    for (size_t i = 0; i < layers; i++)
+        for (int k = 0; k < DAR_PROJECTIONS; k++) dit.block[i].product[k].merged = false;
+    p->dit = &dit;
+    dar_status s = count(p, source, p->o.sampler.skip, flops, e);
+    p->dit = &p->m->dit;
+    free(dit.block);
+    return s;
+}
+
+/* What a video costs with all skips but k; repeat is told by the encoder when it has run. */
+static dar_status count_without(dar_pipeline *p, const dar_condition_source *source, int k, double *flops, dar_err *e)
 {
     const unsigned skip = p->o.sampler.skip;
-    double all, without;
-    for (int k = 0; k < DAR_SKIP_LORA; k++) {
-        dar_status s = skip >> k & 1 ? count(p, source, skip & ~(1u << k), &without, e) : DAR_OK;
-        p->saved[k] = s == DAR_OK && skip >> k & 1 ? without : 0;
-        drop(p);
-        if (s != DAR_OK) return s;
-    }
-    dar_status s = count(p, source, skip, &all, e);
-    for (int k = 0; k < DAR_SKIP_LORA; k++)
-        if (p->saved[k] > 0) p->saved[k] -= all;
+    *flops = 0;
+    if (k == DAR_SKIP_REPEAT || !(skip >> k & 1)) return DAR_OK;
+    dar_status s =
+        k == DAR_SKIP_LORA ? count_apart(p, source, flops, e) : count(p, source, skip & ~(1u << k), flops, e);
+    drop(p);
+    return s;
+}
+
+static dar_status plan(dar_pipeline *p, const dar_condition_source *source, size_t bytes[2], dar_err *e)
+{
+    double all;
+    for (int k = 0; k < DAR_SKIPS; k++) DAR_TRY(count_without(p, source, k, &p->saved[k], e));
+    dar_status s = count(p, source, p->o.sampler.skip, &all, e);
+    for (int k = 0; k < DAR_SKIPS; k++) p->saved[k] = fmax(p->saved[k] - all, 0);
     bytes[0] = p->kept.peak;
     bytes[1] = p->step.peak;
     p->bytes = bytes[0] + bytes[1];
@@ -336,6 +363,7 @@ dar_status dar_pipeline_open(dar_pipeline **out, const dar_model *m, const dar_c
     *out = NULL;
     if (!p) return dar_fail(e, DAR_ERR_NOMEM, "sampling: out of memory");
     p->m = m;
+    p->dit = &m->dit;
     p->condition = c;
     p->path = path;
     p->b = b;

@@ -16,7 +16,8 @@ typedef struct dar_pipeline_options {
     dar_sampler_config sampler;
     dar_noise noise;
     uint64_t seed;
-    const char *noise_file; /* safetensors with one tensor [C, F, h, w], before that any 1s; NULL: drawn */
+    const char *noise_file;  /* safetensors with one tensor [C, F, h, w], before that any 1s; NULL: drawn */
+    int64_t window, overlap; /* latent frames (models/sampler.h); window 0: one, of the whole clip */
 
     /* Embeddings [n, text width] in safetensors: tensor "text", "negative", or the only one.  NULL: the bundle's
      * text.safetensors if it is there; no token. */
@@ -26,6 +27,7 @@ typedef struct dar_pipeline_options {
 typedef struct dar_pipeline {
     const dar_model *m;
     const dar_condition *condition;
+    const dar_dit *dit; /* of m; while counting, perhaps another */
     const char *path;
     dar_bundle *b;
     dar_pipeline_options o;
@@ -35,7 +37,7 @@ typedef struct dar_pipeline {
     /* What a video costs, planned before anything runs. */
     size_t bytes;                           /* of memory, beside the weights */
     double prepare, encode, sample, decode; /* [FLOP]: of a clip; of a video */
-    double saved[DAR_SKIPS];                /* [FLOP] of one video, each skip by itself; lora: not counted */
+    double saved[DAR_SKIPS];                /* [FLOP] of one video, each skip by itself; repeat: of the last made */
 
     /* Of the pipeline itself. */
     dar_arena kept, step;

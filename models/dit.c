@@ -155,7 +155,8 @@ dar_val *dar_dit_embed(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, da
 
 struct head {
     const dar_dit *m;
-    const dar_dit_scene *s;
+    int64_t frame;    /* tokens in a frame */
+    dar_shape latent; /* of the velocity */
 };
 
 /* in: tokens [B, L, D], e [B, R, D] -> [B, C, F, h, w] */
@@ -163,21 +164,27 @@ static dar_val *head(dar_tape *t, void *arg, dar_val *const *in)
 {
     const struct head *a = arg;
     const dar_dit *m = a->m;
-    int64_t B = a->s->latent.d[0], R = in[1]->x.shape.d[1], D = m->c.width;
+    int64_t B = a->latent.d[0], R = in[1]->x.shape.d[1], D = m->c.width;
 
     dar_val *e = dar_reshape(t, in[1], DAR_SHAPE(B, R, 1, D)), *part[2];
     e = dar_add(t, e, dar_param_leaf(t, m->head_modulation)); /* [B, R, 2, D] */
     for (int i = 0; i < 2; i++) part[i] = dar_reshape(t, dar_slice(t, e, 2, i, 1), DAR_SHAPE(B, R, D));
-    dar_norm_opt norm = { .eps = m->c.eps, .split = a->s->frame };
+    dar_norm_opt norm = { .eps = m->c.eps, .split = a->frame };
     dar_val *x = dar_modulate(t, in[0], part[1], part[0], &norm);
     x = dar_linear(t, x, dar_param_leaf(t, m->head_w), dar_param_leaf(t, m->head_b), NULL);
-    return dar_unpatchify(t, x, a->s->latent, m->c.patch);
+    return dar_unpatchify(t, x, a->latent, m->c.patch);
 }
 
 dar_val *dar_dit_head(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e, dar_val *tokens)
 {
-    struct head *a = dar_tape_store(t, &(struct head){ m, s }, sizeof *a);
-    return dar_segment(t, head, a, (dar_val *[]){ tokens, e->e }, 2, m->main, s->latent);
+    struct head *a = dar_tape_store(t, &(struct head){ m, s->frame, s->latent }, sizeof *a);
+    dar_val *rows = e->e;
+    if (s->held) {
+        int64_t R = rows->x.shape.d[1];
+        if (R > 1) rows = dar_slice(t, rows, 1, 1, R - 1);
+        a->latent.d[2]--;
+    }
+    return dar_segment(t, head, a, (dar_val *[]){ tokens, rows }, 2, m->main, a->latent);
 }
 
 dar_val *dar_dit_forward(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x, dar_val *z,

@@ -76,6 +76,7 @@ typedef struct dar_dit_scene {
     int64_t frame;    /* tokens in a frame */
     dar_val *base;    /* [B, L, D] added to the patch embedding; NULL: nothing is */
     dar_val *rope;    /* [L, D / A] */
+    bool held;        /* the velocity of the first frame is not wanted; only where nothing is recorded */
 } dar_dit_scene;
 
 /* clip->cond and clip->known must live as long as the scene; *s and *x below must stay where they are until backward.
@@ -99,7 +100,8 @@ typedef struct dar_dit_time {
     int64_t rows;
 } dar_dit_time;
 
-/* Velocity of z [B, C, F, h, w], of the main type -> the same. */
+/* Velocity of z [B, C, F, h, w], of the main type -> the same; of a scene that is held -> [B, C, F - 1, h, w]: of the
+ * first frame the last block makes keys and values alone. */
 dar_val *dar_dit_forward(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x, dar_val *z,
                          const dar_dit_time *time);
 
@@ -113,6 +115,15 @@ dar_dit_moment dar_dit_time_embed(dar_tape *t, const dar_dit *m, int64_t clips, 
 dar_val *dar_dit_embed(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, dar_val *z); /* -> [B, L, D] */
 dar_val *dar_dit_blocks(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,
                         const dar_dit_moment *e, dar_val *tokens); /* [B, L, D]; overwrites tokens if not recording */
+
+/* The same in two halves, when nothing is recorded.  No text enters the first, so prompts can share it: the first
+ * block's self-attention, in place. */
+void dar_dit_blocks_begin(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e,
+                          dar_val *tokens);
+dar_val *dar_dit_blocks_end(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,
+                            const dar_dit_moment *e, dar_val *tokens);
+
+/* Of a scene that is held: tokens without those of the first frame, velocity without it. */
 dar_val *dar_dit_head(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e, dar_val *tokens);
 
 /* A block by itself: x [B, L, D], as it is (no segment). */

@@ -17,7 +17,21 @@ struct block {
     const dar_dit_scene *s;
     dar_val *log_weight; /* a leaf */
     dar_val *e0, *k, *v; /* inputs of a segment: in a replay, what stands for them */
+    bool rest;           /* of the first frame nothing is wanted but that the others see it */
 };
+
+/* Rows [B, R, ..] of modulations, as the frames after the first take them. */
+static dar_val *later(dar_tape *t, dar_val *e)
+{
+    int64_t R = e->x.shape.d[1];
+    return R > 1 ? dar_slice(t, e, 1, 1, R - 1) : e;
+}
+
+/* Rows of dimension dim that are tokens, without those of the first frame. */
+static dar_val *others(dar_tape *t, const struct block *a, int dim, dar_val *x)
+{
+    return dar_slice(t, x, dim, a->s->frame, x->x.shape.d[dim] - a->s->frame);
+}
 
 /* Three rows of modulation + e0, from `first`: [B, R, D] each */
 static void modulations(dar_tape *t, const struct block *a, int first, dar_val *out[3])
@@ -44,7 +58,7 @@ static dar_norm_opt norm_before(const struct block *a)
     return (dar_norm_opt){ .eps = a->m->c.eps, .cast = true, .out = a->m->storage, .split = a->s->frame };
 }
 
-/* x [B, L, D] -> [B, L, D], all three */
+/* x [B, L, D] -> [B, L, D], all three; with a->rest self-attention gives the tokens after the first frame's alone */
 static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
 {
     dar_attention_opt o = { .heads = a->m->c.heads, .keep = a->m->keep };
@@ -52,11 +66,15 @@ static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
     dar_val *mod[3];
 
     modulations(t, a, 0, mod);
-    dar_val *h = dar_modulate(t, x, mod[SCALE], mod[SHIFT], &norm);
-    dar_val *q = rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h));
-    dar_val *k = rms(t, a, a->b->norm_k[0], product(t, a, DAR_SELF_K, h));
+    dar_val *h = dar_modulate(t, x, mod[SCALE], mod[SHIFT], &norm), *rope = a->s->rope;
+    dar_val *k = dar_rope(t, rms(t, a, a->b->norm_k[0], product(t, a, DAR_SELF_K, h)), rope);
     dar_val *v = product(t, a, DAR_SELF_V, h);
-    h = dar_attention(t, dar_rope(t, q, a->s->rope), dar_rope(t, k, a->s->rope), v, &o);
+    if (a->rest) {
+        h = others(t, a, 1, h), x = others(t, a, 1, x), rope = others(t, a, 0, rope);
+        mod[GATE] = later(t, mod[GATE]);
+    }
+    dar_val *q = dar_rope(t, rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h)), rope);
+    h = dar_attention(t, q, k, v, &o);
     return dar_gate(t, x, product(t, a, DAR_SELF_O, h), mod[GATE], a->s->frame);
 }
 
@@ -98,7 +116,7 @@ static dar_val *block(dar_tape *t, void *arg, dar_val *const *in)
 
 static struct block block_of(const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x, dar_val *e0)
 {
-    return (struct block){ m, &m->block[i], s, x->log_weight, e0, x->k[i], x->v[i] };
+    return (struct block){ m, &m->block[i], s, x->log_weight, e0, x->k[i], x->v[i], false };
 }
 
 dar_val *dar_dit_block_forward(dar_tape *t, const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x,
@@ -115,24 +133,60 @@ static dar_val *segment(dar_tape *t, const struct block *b, dar_val *tokens)
     return dar_segment(t, block, a, in, DAR_COUNT(in), tokens->x.dtype, tokens->x.shape);
 }
 
-/* Nothing looks back: one stream, written over after every part. */
-static void in_place(dar_tape *t, const struct block *a, dar_val *tokens)
+static void in_place(dar_tape *t, part_fn *part, const struct block *a, dar_val *from, dar_val *to)
 {
-    for (size_t i = 0; i < DAR_COUNT(parts); i++) {
-        dar_mark m = dar_arena_mark(t->arena);
-        dar_val *y = parts[i](t, a, tokens);
-        if (!t->arena->plan) dar_tensor_copy(&tokens->x, &y->x);
-        dar_arena_reset(t->arena, m);
+    dar_mark m = dar_arena_mark(t->arena);
+    dar_val *y = part(t, a, from);
+    if (!t->arena->plan) dar_tensor_copy(&to->x, &y->x);
+    dar_arena_reset(t->arena, m);
+}
+
+/* Nothing looks back: one stream, written over after every part. */
+static dar_val *parts_in_place(dar_tape *t, struct block a, size_t first, dar_val *tokens)
+{
+    for (size_t i = first; i < DAR_COUNT(parts); i++) {
+        dar_val *to = a.rest ? others(t, &a, 1, tokens) : tokens;
+        in_place(t, parts[i], &a, tokens, to);
+        if (a.rest) a.e0 = later(t, a.e0);
+        a.rest = false;
+        tokens = to;
     }
+    return tokens;
+}
+
+void dar_dit_blocks_begin(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e,
+                          dar_val *tokens)
+{
+    struct block a = { .m = m, .b = &m->block[0], .s = s, .e0 = e->e0 };
+    DAR_ASSERT(!t->recording, "dit: halves are not recorded");
+    in_place(t, parts[0], &a, tokens, tokens);
+}
+
+dar_val *dar_dit_blocks_end(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,
+                            const dar_dit_moment *e, dar_val *tokens)
+{
+    for (int i = 0; i < m->c.layers; i++) {
+        struct block a = block_of(m, i, s, x, e->e0);
+        a.rest = s->held && i == m->c.layers - 1;
+        if (a.rest && i == 0) {
+            a.e0 = later(t, a.e0), tokens = others(t, &a, 1, tokens);
+            a.rest = false;
+        }
+        tokens = parts_in_place(t, a, i == 0, tokens);
+    }
+    return tokens;
 }
 
 dar_val *dar_dit_blocks(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,
                         const dar_dit_moment *e, dar_val *tokens)
 {
+    if (!t->recording) {
+        dar_dit_blocks_begin(t, m, s, e, tokens);
+        return dar_dit_blocks_end(t, m, s, x, e, tokens);
+    }
     for (int i = 0; i < m->c.layers; i++) {
         struct block a = block_of(m, i, s, x, e->e0);
-        if (!t->recording) in_place(t, &a, tokens);
-        else if (m->whole) tokens = dar_dit_block_forward(t, m, i, s, x, e->e0, tokens);
+        if (m->whole) tokens = dar_dit_block_forward(t, m, i, s, x, e->e0, tokens);
         else tokens = segment(t, &a, tokens);
     }
     return tokens;

@@ -10,8 +10,16 @@
  *   text      keys and values of a prompt once, not in every call
  *   times     one embedding of time for the first frame and one for the rest, not one per frame
  *   padding   the zeros after a prompt are one weighted key
+ *   begin     what comes before the first word is read, to the first block's self-attention, is done for both prompts
+ *   held      of a first frame that is known the last block makes keys and values alone: its velocity is not used
  *   lora      low-rank additions are added to the weights once (models/model.h)
  *   repeat    pieces of the known video that must encode to the same are not encoded (infer/pipeline.h)
+ *
+ * A clip longer than the network was trained for is seen through windows.  Each is the first frame, which is what the
+ * clip shall look like, and a run of those after it, with their own share of the condition: rays and geometry say which
+ * point of the first frame a point of a later one is, however far apart the two are in time.  Neighbours overlap; there
+ * the velocity goes over from one to the other in equal steps, at every step of the solver, so that there is one latent
+ * and no seam to repair.  One window is the plain run.
  *
  * One clip at a time; the same bits for any number of threads.  Source: the paper, section 4.3; Ho and Salimans 2022,
  * eq. 6 (guidance). */
@@ -27,6 +35,8 @@ typedef enum dar_skip {
     DAR_SKIP_TEXT,
     DAR_SKIP_TIMES,
     DAR_SKIP_PADDING,
+    DAR_SKIP_BEGIN,
+    DAR_SKIP_HELD,
     DAR_SKIP_LORA,
     DAR_SKIP_REPEAT,
     DAR_SKIPS
@@ -50,18 +60,25 @@ typedef struct dar_sampler_clip {
     int64_t frames, height, width; /* of the latent */
     dar_tensor cond;               /* [1, C, F, H, W] of the adapter, f32; data NULL: its output counts as 0 */
     dar_tensor text[2];            /* [1, n, text width]: prompt, negative prompt; data NULL: no token */
+    int64_t window, overlap;       /* latent frames of a window, the first included; of two after it.  0: one window */
 } dar_sampler_clip;
+
+/* How many windows a clip takes: as few as overlap by that much or more.  Window i is the clip's frame 0 and, spread
+ * evenly, window - 1 frames from `first`. */
+int64_t dar_sampler_windows(const dar_sampler_clip *c);
+int64_t dar_sampler_window_first(const dar_sampler_clip *c, int64_t i);
 
 typedef struct dar_sampler {
     const dar_dit *m;
     dar_sampler_config c;
     dar_sampler_clip clip;
-    bool twice;   /* a step calls the network for both prompts */
-    size_t calls; /* of the network, so far */
+    bool twice;      /* a step calls the network for both prompts */
+    size_t calls;    /* of the network, so far */
+    int64_t windows; /* 1: there is one, of the whole clip */
 
     /* Of the sampler itself. */
     dar_tape kept, step;
-    dar_dit_scene scene;
+    dar_dit_scene *scene; /* [windows] */
     dar_dit_text text[2];
 } dar_sampler;
 
@@ -71,8 +88,9 @@ dar_status dar_sampler_init(dar_sampler *s, const dar_dit *m, const dar_sampler_
                             dar_arena *kept, dar_arena *step, dar_err *e);
 void dar_sampler_free(dar_sampler *s); /* accepts a zeroed one; the arenas are the caller's */
 
-/* After each step: how many are done, and the latent as it is.  Anything but DAR_OK ends the run. */
-typedef dar_status dar_sampler_told(void *ctx, size_t done, const dar_tensor *z, dar_err *e);
+/* After each step: how many are done, the latent as it is, and where the step saw it go: z - sigma v.  Anything but
+ * DAR_OK ends the run. */
+typedef dar_status dar_sampler_told(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e);
 
 /* z [1, latent, F, h, w] of the main type: noise becomes the latent.
  *

@@ -113,11 +113,8 @@ static void write_bundles(void)
                                "f 1 8 4\nf 2 3 7\nf 2 7 6\n";
     static const struct {
         const char *name, *size, *frames, *families;
-    } made[] = { { "clip", "40x24", "9", "all" },
-                 { "odd", "44x24", "9", "all" },
-                 { "uneven", "40x24", "7", "all" },
-                 { "one", "40x24", "1", "all" },
-                 { "poor", "40x24", "9", "depth" } };
+    } made[] = { { "clip", "40x24", "9", "all" }, { "odd", "44x24", "9", "all" },   { "uneven", "40x24", "7", "all" },
+                 { "one", "40x24", "1", "all" },  { "long", "40x24", "21", "all" }, { "poor", "40x24", "9", "depth" } };
     run_write("cube.obj", cube, sizeof cube - 1);
     for (size_t i = 0; i < DAR_COUNT(made); i++) {
         int status = RUN_PROGRAM(bundler, "render", "cube.obj", "-o", made[i].name, "--size", made[i].size, "--frames",
@@ -145,6 +142,18 @@ static double printed(const char *key)
     dar_err e;
     CHECK(dar_json_parse(&doc, "standard output", ran.out, strlen(ran.out), &e) == DAR_OK, "%s", e.text);
     double x = dar_json_number(dar_json_root(doc), key, NAN, -1e300, 1e300);
+    dar_json_close(doc);
+    return x;
+}
+
+/* Of the first bundle. */
+static double printed_in(const char *object, const char *key)
+{
+    dar_json_doc *doc;
+    dar_err e;
+    CHECK(dar_json_parse(&doc, "standard output", ran.out, strlen(ran.out), &e) == DAR_OK, "%s", e.text);
+    dar_json first = dar_json_first(dar_json_array(dar_json_root(doc), "bundles"));
+    double x = dar_json_number(dar_json_object(first, object), key, NAN, -1e300, 1e300);
     dar_json_close(doc);
     return x;
 }
@@ -381,6 +390,24 @@ static void solvers_and_noise(void **state)
     dar_arena_free(&a);
 }
 
+/* One window is the plain run; several are another video, whatever the threads. */
+static void windows(void **state)
+{
+    (void)state;
+    GOOD("long", "-o", "w0", MODEL, "--reference", "a.png", "--json");
+    CHECK(printed_in("flops_saved", "begin") == 0 && printed_in("flops_saved", "held") > 0, "%s", ran.out);
+    CHECK(printed_in("flops_saved", "repeat") > 0, "%s", ran.out); /* grey after grey */
+    GOOD("long", "-o", "w1", MODEL, "--reference", "a.png", "--window", "21");
+    same_frames("w0", "w1");
+    GOOD("long", "-o", "w2", MODEL, "--reference", "a.png", "--window", "13", "--threads", "1");
+    GOOD("long", "-o", "w3", MODEL, "--reference", "a.png", "--window", "13", "--overlap", "4", "--threads", "2");
+    same_frames("w2", "w3");
+    assert_true(frames_differ("w0", "w2"));
+    GOOD("long", "-o", "never", MODEL, "--window", "13", "--dry-run");
+    BAD(2, "expected 9, 13", "long", "-o", "x", MODEL, "--window", "12");
+    BAD(2, "up to 8 frames", "long", "-o", "x", MODEL, "--window", "13", "--overlap", "12");
+}
+
 static void dry_run(void **state)
 {
     (void)state;
@@ -442,7 +469,7 @@ int main(int argc, char **argv)
     static const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_video), cmocka_unit_test(any_threads), cmocka_unit_test(batches),
         cmocka_unit_test(stopped), cmocka_unit_test(ten_clips),   cmocka_unit_test(solvers_and_noise),
-        cmocka_unit_test(dry_run), cmocka_unit_test(refusals),
+        cmocka_unit_test(windows), cmocka_unit_test(dry_run),     cmocka_unit_test(refusals),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
     return cmocka_run_group_tests_name("dar-sample", tests, in_directory, remove_directory) != 0;

@@ -79,7 +79,7 @@ struct walk {
     double worst;
 };
 
-static dar_status look(void *ctx, size_t done, const dar_tensor *z, dar_err *e)
+static dar_status look(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e)
 {
     struct walk *w = ctx;
     assert_int_equal(done, ++w->seen);
@@ -91,6 +91,7 @@ static dar_status look(void *ctx, size_t done, const dar_tensor *z, dar_err *e)
         double off = test_relative(z, &y);
         CHECK(off >= 0, "step %zu is not finite", done);
         w->worst = fmax(w->worst, off);
+        if (done == 5) CHECK_NEAR("where the last step goes", test_relative(clean, z), 0, 1e-14); /* sigma is 0 there */
     }
     return done == w->stop ? dar_fail(e, DAR_ERR_INTERRUPTED, "enough") : DAR_OK;
 }
@@ -160,6 +161,160 @@ static void skips_change_nothing(void **state)
         CHECK_NEAR("latent", off, 0, 1e-5);
         assert_int_equal(calls, 10);
     }
+    drop(&b);
+}
+
+/* One block alone: the first is the last. */
+static void held_in_one_block(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    init(&b, DAR_F64);
+    b.o.m.c.layers = 1;
+    dar_tensor with = sample(&b, &w, NULL);
+    b.c.skip = 0, w.seen = 0;
+    dar_tensor without = sample(&b, &w, NULL);
+    CHECK_NEAR("latent", test_relative(&without, &with), 0, 1e-13);
+    b.c.skip = DAR_SKIPS_ALL, b.alone = true, w.seen = 0; /* no first frame to hold */
+    with = sample(&b, &w, NULL);
+    b.c.skip = 0, w.seen = 0;
+    without = sample(&b, &w, NULL);
+    CHECK_NEAR("latent", test_relative(&without, &with), 0, 1e-13);
+    drop(&b);
+}
+
+/* ---------------------------------------------------------------- windows */
+
+/* Every frame is seen; neighbours share what was asked for or more; all are of one length. */
+static void windows_cover(void **state)
+{
+    (void)state;
+    for (int64_t F = 2; F < 40; F++)
+        for (int64_t n = 3; n < 12; n++)
+            for (int64_t shared = 0; shared < n - 1; shared++) {
+                dar_sampler_clip c = { .frames = F, .window = n, .overlap = shared };
+                int64_t count = dar_sampler_windows(&c), before = 1;
+                if (n >= F) assert_int_equal(count, 1);
+                for (int64_t i = 0; i < count; i++) {
+                    int64_t first = dar_sampler_window_first(&c, i);
+                    if (i) CHECK(first > before && before + n - 1 - first >= shared, "F %d n %d", (int)F, (int)n);
+                    else assert_int_equal(first, 1);
+                    before = first;
+                }
+                if (count > 1) assert_int_equal(before + n - 1, F);
+            }
+}
+
+/* Another clip, of these frames of the fixture's. */
+static void edit(struct bench *b, const struct bench *from, const int *frame, int64_t frames)
+{
+    const dar_tensor *x[] = { &from->clip.cond, &from->known, &from->noise };
+    dar_tensor *y[] = { &b->clip.cond, &b->known, &b->noise };
+    for (int i = 0; i < 3; i++) {
+        dar_shape s = x[i]->shape;
+        s.d[2] = frames;
+        *y[i] = dar_tensor_push(&b->o.weights, x[i]->dtype, s);
+        for (int64_t f = 0; f < frames; f++) {
+            dar_tensor to = dar_tensor_narrow(y[i], 2, f, 1), frame_of = dar_tensor_narrow(x[i], 2, frame[f] % 3, 1);
+            dar_tensor_copy(&to, &frame_of);
+        }
+    }
+    b->clip.frames = frames;
+}
+
+static double apart(const dar_tensor *x, int64_t i, const dar_tensor *y, int64_t k)
+{
+    dar_arena a;
+    dar_err e;
+    dar_tensor f[2] = { dar_tensor_narrow(x, 2, i, 1), dar_tensor_narrow(y, 2, k, 1) }, own[2];
+    assert_int_equal(dar_arena_init(&a, "frames", 1 << 16, &e), DAR_OK);
+    for (int p = 0; p < 2; p++) {
+        own[p] = dar_tensor_push(&a, x->dtype, f[p].shape);
+        dar_tensor_copy(&own[p], &f[p]);
+    }
+    double off = test_relative(&own[0], &own[1]);
+    dar_arena_free(&a);
+    return off;
+}
+
+static const int line[] = { 0, 1, 2, 3, 4, 5, 6, 7, 8 };
+
+/* Windows as long as the clip are the plain run. */
+static void one_window(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    size_t calls;
+    init(&b, DAR_F64);
+    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
+    edit(&b, &from, line, 9);
+    dar_tensor plain = sample(&b, &w, &calls);
+    assert_int_equal(calls, 10);
+    b.clip.window = 9, b.clip.overlap = 4, w.seen = 0;
+    dar_tensor one = sample(&b, &w, &calls);
+    assert_int_equal(calls, 10);
+    same_bits(&plain, &one);
+    drop(&b);
+}
+
+static void several_windows(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    size_t calls;
+    init(&b, DAR_F64);
+    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
+    edit(&b, &from, line, 9);
+    b.clip.window = 5, b.clip.overlap = 2; /* frames 1 2 3 4, 3 4 5 6, 5 6 7 8 */
+    dar_tensor many = sample(&b, &w, &calls);
+    assert_int_equal(calls, 30);
+    CHECK_NEAR("first frame", apart(&many, 0, &b.first, 0), 0, 0);
+    b.c.skip = 0, w.seen = 0;
+    dar_tensor slow = sample(&b, &w, NULL);
+    CHECK_NEAR("without skips", test_relative(&slow, &many), 0, 1e-12);
+
+    /* Without overlap, of frames that repeat, each window gives the same: positions are those of the window. */
+    b.c.skip = DAR_SKIPS_ALL, w.seen = 0;
+    edit(&b, &from, line, 7);
+    b.clip.window = 4, b.clip.overlap = 0; /* 1 2 3, 4 5 6 */
+    many = sample(&b, &w, &calls);
+    assert_int_equal(calls, 20);
+    for (int f = 1; f < 4; f++) CHECK_NEAR("three frames later", apart(&many, f, &many, f + 3), 0, 0);
+    drop(&b);
+}
+
+/* In a step, frames that two windows share lie between what each makes of them alone, and go over from one to the other
+ * in equal parts: no frame differs from the next by more than one part of what the windows differ by. */
+static void no_seam(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    dar_tensor alone[2];
+    init(&b, DAR_F64);
+    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
+    b.c.solver.steps = 1;
+    for (int i = 0; i < 2; i++) {
+        w.seen = 0;
+        edit(&b, &from, (const int[2][5]){ { 0, 1, 2, 3, 4 }, { 0, 3, 4, 5, 6 } }[i], 5);
+        alone[i] = sample(&b, &w, NULL);
+    }
+    w.seen = 0;
+    edit(&b, &from, line, 7);
+    b.clip.window = 5, b.clip.overlap = 2;
+    dar_tensor both = sample(&b, &w, NULL);
+    for (int64_t f = 1; f < 7; f++)
+        for (int64_t c = 0; c < 5; c++)
+            for (int64_t i = 0; i < 4 * 6; i++) {
+                double x = dar_dtype_get(DAR_F64, both.data, (size_t)((c * 7 + f) * 24 + i));
+                double p = f < 5 ? dar_dtype_get(DAR_F64, alone[0].data, (size_t)((c * 5 + f) * 24 + i)) : 0;
+                double q = f > 2 ? dar_dtype_get(DAR_F64, alone[1].data, (size_t)((c * 5 + f - 2) * 24 + i)) : 0;
+                double share = f < 3 ? 0 : f > 4 ? 1 : (double)(f - 2) / 3;
+                CHECK_NEAR("between its windows", x, (1 - share) * p + share * q, 1e-13);
+            }
     drop(&b);
 }
 
@@ -312,6 +467,11 @@ int main(void)
     static const struct CMUnitTest tests[] = {
         cmocka_unit_test(five_steps),
         cmocka_unit_test(skips_change_nothing),
+        cmocka_unit_test(held_in_one_block),
+        cmocka_unit_test(windows_cover),
+        cmocka_unit_test(one_window),
+        cmocka_unit_test(several_windows),
+        cmocka_unit_test(no_seam),
         cmocka_unit_test(equal_prompts_are_one),
         cmocka_unit_test(any_threads),
         cmocka_unit_test(prepared_once),
