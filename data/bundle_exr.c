@@ -168,5 +168,5 @@ dar_status dar_bundle_exr_write(const char *path, size_t width, size_t height, c
         }
     }
     DAR_ASSERT(n > 0, "%s: no families", path);
-    return dar_exr_write(path, width, height, plane, n, compression, e);
+    return dar_exr_write(path, width, height, plane, n, &(dar_exr_how){ .compression = compression }, e);
 }

@@ -148,8 +148,8 @@ static dar_status make_rgb(dar_bundle_writer *w, dar_err *e)
     DAR_TRY(dar_h5_make(w->rgb, "rgb", &a, e));
     w->c.rgb = w->c.reference = true;
     if (m->width % 2 || m->height % 2) return DAR_OK;
-    return dar_video_create(&w->video, in_dir(w, DAR_BUNDLE_VIDEO, path), (size_t)m->width, (size_t)m->height, m->fps,
-                            DAR_VIDEO_H264, e);
+    return dar_video_create(&w->video, in_dir(w, DAR_BUNDLE_VIDEO, path), (size_t)m->width, (size_t)m->height,
+                            &(dar_video_how){ m->fps, DAR_VIDEO_H264, NULL }, e);
 }
 
 static size_t stream_size(const dar_bundle_writer *w, int i)

@@ -113,14 +113,15 @@ static dar_status refused(const char *path, const struct stream *s, exr_result_t
 /* ---------------------------------------------------------------- writing */
 
 static exr_result_t define(exr_context_t ctx, size_t width, size_t height, const dar_exr_plane *plane, size_t planes,
-                           dar_exr_compression compression)
+                           const dar_exr_how *how)
 {
     static const exr_compression_t code[] = { EXR_COMPRESSION_NONE, EXR_COMPRESSION_ZIP, EXR_COMPRESSION_PXR24 };
     static const exr_pixel_type_t type[] = { EXR_PIXEL_UINT, EXR_PIXEL_HALF, EXR_PIXEL_FLOAT };
     int part;
     exr_result_t r = exr_add_part(ctx, NULL, EXR_STORAGE_SCANLINE, &part);
     if (r == EXR_ERR_SUCCESS)
-        r = exr_initialize_required_attr_simple(ctx, part, (int)width, (int)height, code[compression]);
+        r = exr_initialize_required_attr_simple(ctx, part, (int)width, (int)height, code[how->compression]);
+    if (r == EXR_ERR_SUCCESS && how->comment) r = exr_attr_set_string(ctx, part, "comments", how->comment);
     for (size_t i = 0; i < planes && r == EXR_ERR_SUCCESS; i++)
         r = exr_add_channel(ctx, part, plane[i].name, type[plane[i].type], EXR_PERCEPTUALLY_LOGARITHMIC, 1, 1);
     return r == EXR_ERR_SUCCESS ? exr_write_header(ctx) : r;
@@ -164,7 +165,7 @@ static exr_result_t write_chunks(exr_context_t ctx, size_t width, size_t height,
 }
 
 dar_status dar_exr_write(const char *path, size_t width, size_t height, const dar_exr_plane *plane, size_t planes,
-                         dar_exr_compression compression, dar_err *e)
+                         const dar_exr_how *how, dar_err *e)
 {
     struct stream stream = { 0 };
     exr_context_t ctx = NULL;
@@ -179,7 +180,7 @@ dar_status dar_exr_write(const char *path, size_t width, size_t height, const da
         exr_context_initializer_t c = setup(&stream);
         c.write_fn = write_at;
         exr_result_t r = exr_start_write(&ctx, path, EXR_WRITE_FILE_DIRECTLY, &c);
-        if (r == EXR_ERR_SUCCESS) r = define(ctx, width, height, plane, planes, compression);
+        if (r == EXR_ERR_SUCCESS) r = define(ctx, width, height, plane, planes, how);
         if (r == EXR_ERR_SUCCESS) r = write_chunks(ctx, width, height, plane, planes);
         exr_result_t last = ctx ? exr_finish(&ctx) : r;
         if (r == EXR_ERR_SUCCESS) r = last;

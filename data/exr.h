@@ -24,9 +24,14 @@ typedef struct dar_exr_plane {
     const void *data; /* [height, width] */
 } dar_exr_plane;
 
+typedef struct dar_exr_how {
+    dar_exr_compression compression;
+    const char *comment; /* attribute "comments"; NULL: none */
+} dar_exr_how;
+
 /* Replace the file in one moment.  Names must differ. */
 dar_status dar_exr_write(const char *path, size_t width, size_t height, const dar_exr_plane *plane, size_t planes,
-                         dar_exr_compression compression, dar_err *e);
+                         const dar_exr_how *how, dar_err *e);
 
 typedef struct dar_exr dar_exr;
 

@@ -127,19 +127,32 @@ static void write_failed(png_structp png, png_const_charp why)
     png_longjmp(png, 1);
 }
 
-static void encode_rows(png_structp png, png_infop info, size_t width, size_t height, int channels, const uint8_t *data)
+static void set_comment(png_structp png, png_infop info, const char *comment)
 {
-    int color = channels == 1 ? PNG_COLOR_TYPE_GRAY : channels == 3 ? PNG_COLOR_TYPE_RGB : PNG_COLOR_TYPE_RGB_ALPHA;
+    bool ascii = true;
+    for (const char *c = comment; *c; c++) ascii &= (unsigned char)*c < 128;
+    png_text text = { .compression = ascii ? PNG_TEXT_COMPRESSION_NONE : PNG_ITXT_COMPRESSION_NONE };
+    text.key = (char *)(uintptr_t) "Comment";
+    text.text = (char *)(uintptr_t)comment;
+    png_set_text(png, info, &text, 1);
+}
+
+static void encode_rows(png_structp png, png_infop info, const dar_png *p)
+{
+    int color = p->channels == 1   ? PNG_COLOR_TYPE_GRAY
+                : p->channels == 3 ? PNG_COLOR_TYPE_RGB
+                                   : PNG_COLOR_TYPE_RGB_ALPHA;
     png_set_user_limits(png, DAR_IMAGE_MAX_SIDE, DAR_IMAGE_MAX_SIDE);
-    png_set_IHDR(png, info, (png_uint_32)width, (png_uint_32)height, 8, color, PNG_INTERLACE_NONE,
+    png_set_IHDR(png, info, (png_uint_32)p->width, (png_uint_32)p->height, 8, color, PNG_INTERLACE_NONE,
                  PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
     png_set_sRGB(png, info, PNG_sRGB_INTENT_PERCEPTUAL);
+    if (p->comment) set_comment(png, info, p->comment);
     png_write_info(png, info);
-    for (size_t y = 0; y < height; y++) png_write_row(png, data + y * width * (size_t)channels);
+    for (size_t y = 0; y < p->height; y++) png_write_row(png, p->data + y * p->width * (size_t)p->channels);
     png_write_end(png, NULL);
 }
 
-static void encode(struct sink *k, size_t width, size_t height, int channels, const uint8_t *data)
+static void encode(struct sink *k, const dar_png *p)
 {
     png_structp png = png_create_write_struct(PNG_LIBPNG_VER_STRING, k, write_failed, warned);
     png_infop info = png ? png_create_info_struct(png) : NULL;
@@ -149,20 +162,25 @@ static void encode(struct sink *k, size_t width, size_t height, int channels, co
         if (k->s == DAR_OK) k->s = dar_fail(k->e, DAR_ERR_IO, "%s: PNG: %s", k->out.path, k->why);
     } else {
         png_set_write_fn(png, k, put, flush);
-        encode_rows(png, info, width, height, channels, data);
+        encode_rows(png, info, p);
     }
     png_destroy_write_struct(&png, &info);
 }
 
-dar_status dar_png_write(const char *path, size_t width, size_t height, int channels, const uint8_t *data, dar_err *e)
+dar_status dar_png_save(const char *path, const dar_png *p, dar_err *e)
 {
     struct sink k = { .e = e };
-    DAR_ASSERT(width && height && width <= DAR_IMAGE_MAX_SIDE && height <= DAR_IMAGE_MAX_SIDE &&
-                   (channels == 1 || channels == 3 || channels == 4),
-               "%s: %zux%zu, %d channels", path, width, height, channels);
+    DAR_ASSERT(p->width && p->height && p->width <= DAR_IMAGE_MAX_SIDE && p->height <= DAR_IMAGE_MAX_SIDE &&
+                   (p->channels == 1 || p->channels == 3 || p->channels == 4),
+               "%s: %zux%zu, %d channels", path, p->width, p->height, p->channels);
     k.s = dar_file_create(&k.out, path, e);
-    if (k.s == DAR_OK) encode(&k, width, height, channels, data);
+    if (k.s == DAR_OK) encode(&k, p);
     if (k.s == DAR_OK) k.s = dar_file_commit(&k.out, e);
     dar_file_discard(&k.out);
     return k.s;
+}
+
+dar_status dar_png_write(const char *path, size_t width, size_t height, int channels, const uint8_t *data, dar_err *e)
+{
+    return dar_png_save(path, &(dar_png){ width, height, channels, data, NULL }, e);
 }

@@ -15,4 +15,13 @@ dar_status dar_png_decode(const dar_image *im, const char *name, const void *dat
 /* Replace the file in one moment: 8 bits, channels 1 (grey), 3 (RGB) or 4 (RGBA), rows without gaps. */
 dar_status dar_png_write(const char *path, size_t width, size_t height, int channels, const uint8_t *data, dar_err *e);
 
+/* The same with a text, "Comment": in a tEXt chunk, or where it is not of ASCII alone in an iTXt chunk, as UTF-8. */
+typedef struct dar_png {
+    size_t width, height;
+    int channels;
+    const uint8_t *data;
+    const char *comment; /* NULL: none */
+} dar_png;
+dar_status dar_png_save(const char *path, const dar_png *p, dar_err *e);
+
 #endif

@@ -161,9 +161,18 @@ static const struct {
     [DAR_VIDEO_X264RGB] = { "matroska", "libx264rgb", "rgb24", "-qp", "0" },
 };
 
-static dar_status encode(dar_video *v, size_t width, size_t height, double fps, dar_video_codec codec, dar_err *e)
+/* `name=value`, or NULL if there is none; on the heap. */
+static dar_status tag(char **out, const char *path, const char *name, const char *value, dar_err *e)
 {
-    char to[PATH_MAX + 8], size[32], rate[32];
+    *out = NULL;
+    if (!value || asprintf(out, "%s=%s", name, value) >= 0) return DAR_OK;
+    return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
+}
+
+static dar_status encode(dar_video *v, size_t width, size_t height, const dar_video_how *how, dar_err *e)
+{
+    const dar_video_codec codec = how->codec;
+    char to[PATH_MAX + 8], size[32], rate[32], *comment;
     const char *argv[48] = { "ffmpeg",
                              "-nostdin",
                              "-v",
@@ -199,29 +208,36 @@ static dar_status encode(dar_video *v, size_t width, size_t height, double fps, 
                                           "+faststart" };
     size_t n = 21;
     DAR_TRY(as_file(to, sizeof to, v->out.temp, e));
+    DAR_TRY(tag(&comment, v->path, "comment", how->comment, e));
     snprintf(size, sizeof size, "%zux%zu", width, height);
-    snprintf(rate, sizeof rate, "%.6f", fps);
+    snprintf(rate, sizeof rate, "%.6f", how->fps);
     for (size_t i = 0; i < DAR_COUNT(colour) && codec == DAR_VIDEO_H264; i++) argv[n++] = colour[i];
+    if (comment) {
+        argv[n++] = "-metadata";
+        argv[n++] = comment;
+    }
     argv[n++] = "-f";
     argv[n++] = codecs[codec].format;
     argv[n++] = "-y";
     argv[n++] = to;
-    return start(&v->child, (char *const *)(uintptr_t)argv, 0, v->path, e);
+    dar_status s = start(&v->child, (char *const *)(uintptr_t)argv, 0, v->path, e);
+    free(comment);
+    return s;
 }
 
-dar_status dar_video_create(dar_video **out, const char *path, size_t width, size_t height, double fps,
-                            dar_video_codec codec, dar_err *e)
+dar_status dar_video_create(dar_video **out, const char *path, size_t width, size_t height, const dar_video_how *how,
+                            dar_err *e)
 {
-    DAR_ASSERT((unsigned)codec < DAR_VIDEO_CODECS, "%s: codec %d", path, (int)codec);
+    DAR_ASSERT((unsigned)how->codec < DAR_VIDEO_CODECS, "%s: codec %d", path, (int)how->codec);
     DAR_ASSERT(width && height && width <= DAR_VIDEO_MAX_SIDE && height <= DAR_VIDEO_MAX_SIDE, "%s: %zux%zu", path,
                width, height);
-    DAR_ASSERT(fps > 0 && fps <= 1000, "%s: %g frames per second", path, fps);
+    DAR_ASSERT(how->fps > 0 && how->fps <= 1000, "%s: %g frames per second", path, how->fps);
     *out = NULL;
-    if (codec == DAR_VIDEO_H264 && (width | height) & 1)
+    if (how->codec == DAR_VIDEO_H264 && (width | height) & 1)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found %zux%zu, expected even sides for yuv420p", path, width, height);
     dar_status s = allocate(out, path, e);
     if (s == DAR_OK) s = dar_file_create(&(*out)->out, path, e);
-    if (s == DAR_OK) s = encode(*out, width, height, fps, codec, e);
+    if (s == DAR_OK) s = encode(*out, width, height, how, e);
     if (s == DAR_OK) {
         (*out)->bytes = 3 * width * height;
     } else {

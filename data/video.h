@@ -22,9 +22,15 @@ typedef enum dar_video_codec {
 
 typedef struct dar_video dar_video;
 
+typedef struct dar_video_how {
+    double fps;
+    dar_video_codec codec;
+    const char *comment; /* of the file; NULL: none */
+} dar_video_how;
+
 /* Start writing under a temporary name.  On failure *out is NULL. */
-dar_status dar_video_create(dar_video **out, const char *path, size_t width, size_t height, double fps,
-                            dar_video_codec codec, dar_err *e);
+dar_status dar_video_create(dar_video **out, const char *path, size_t width, size_t height, const dar_video_how *how,
+                            dar_err *e);
 dar_status dar_video_write(dar_video *v, const uint8_t *rgb, dar_err *e);
 
 /* Wait for the encoder, then rename to `path`.  The caller still owes dar_video_close and does nothing else. */

@@ -22,7 +22,7 @@ static struct {
     int solver, grid, precision, skip;
     int64_t window, overlap;
     dar_arg_list references, no_skip;
-    bool no_png, no_mp4, no_sheet, mkv, overwrite;
+    bool no_png, no_mp4, no_sheet, exr, mkv, overwrite;
     dar_common common;
 } o = { .overlap = -1 };
 
@@ -83,7 +83,7 @@ static const dar_option options[] = {
     { .name = "no-skip", .placeholder = "NAME", .type = DAR_ARG_LIST, .target = &o.no_skip,
       .help = "all but pass, scene, text, times, padding, begin, held, lora or repeat (models/sampler.h)" },
     { .name = "window", .placeholder = "T", .type = DAR_ARG_INT, .target = &o.window, .standard = "0", .lo = 0,
-      .hi = 100001, .help = "clips of more frames than the model was trained for: through windows of T frames, 4 n + 1, "
+      .hi = 100001, .help = "clips longer than the model was trained for: through windows of T frames, 4 n + 1, "
       "each with the first frame; 0: all at once" },
     { .name = "overlap", .placeholder = "T", .type = DAR_ARG_INT, .target = &o.overlap, .lo = 0, .hi = 100000,
       .help = "frames that neighbouring windows share, 4 n (default: a quarter of a window)" },
@@ -92,6 +92,8 @@ static const dar_option options[] = {
     { .name = "no-png", .type = DAR_ARG_FLAG, .target = &o.no_png, .help = "no frames/00000.png ..." },
     { .name = "no-mp4", .type = DAR_ARG_FLAG, .target = &o.no_mp4, .help = "no video.mp4" },
     { .name = "no-sheet", .type = DAR_ARG_FLAG, .target = &o.no_sheet, .help = "no contact sheet" },
+    { .name = "exr", .type = DAR_ARG_FLAG, .target = &o.exr,
+      .help = "exr/00000.exr ...: with depth, matte and ids of the bundle, for compositing" },
     { .name = "mkv", .type = DAR_ARG_FLAG, .target = &o.mkv, .help = "video.mkv, exact" },
 };
 /* clang-format on */
@@ -312,6 +314,7 @@ static dar_status print_settings(dar_json_writer *w, const struct job *j, const 
     DAR_TRY(print_hashed(w, "noise_file", j->how.noise_file, j->how.noise_file, e));
     print_sampler(w, j);
     dar_json_write_bool(w, "png", !o.no_png);
+    dar_json_write_bool(w, "exr", o.exr);
     dar_json_write_bool(w, "mp4", !o.no_mp4);
     dar_json_write_bool(w, "mkv", o.mkv);
     dar_json_write_bool(w, "sheet", !o.no_sheet);
@@ -376,14 +379,15 @@ static void tell_video(struct job *j, const dar_pipeline *p, const struct hearin
 static dar_status render(struct job *j, dar_pipeline *p, const char *path, const uint8_t *rgb, const char *settings,
                          dar_err *e)
 {
-    const dar_output_options files = { !o.no_png, !o.no_mp4, o.mkv, !o.no_sheet, o.overwrite };
+    const dar_output_options files = { !o.no_png, o.exr, !o.no_mp4, o.mkv, !o.no_sheet, o.overwrite };
     struct hearing h = { .path = path, .begun = dar_log_clock() };
     const dar_pipeline_listener listener = { hear_frame, hear_stage, &h };
     h.progress = dar_progress_begin(path, "steps", (double)o.steps);
-    DAR_TRY(dar_output_create(&h.output, path, p->b, &j->condition, &p->cond, rgb, &files, e));
+    const dar_output_shown shown = { &j->condition, &p->cond, rgb };
+    DAR_TRY(dar_output_create(&h.output, path, p->b, &shown, settings, &files, e));
     dar_status s = dar_pipeline_render(p, rgb, &listener, e);
     dar_progress_end(&h.progress);
-    if (s == DAR_OK) s = dar_output_commit(h.output, settings, e);
+    if (s == DAR_OK) s = dar_output_commit(h.output, e);
     dar_output_discard(h.output);
     if (s == DAR_OK) tell_video(j, p, &h);
     return s;

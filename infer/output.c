@@ -11,6 +11,7 @@
 #include "data/png.h"
 #include "data/sheet.h"
 #include "data/video.h"
+#include "infer/layers.h"
 #include "lib/dir.h"
 #include "lib/file.h"
 #include "lib/size.h"
@@ -27,6 +28,8 @@ struct dar_output {
     dar_dir_out dir;
     dar_video *video[VIDEOS];
     dar_sheet sheet;
+    dar_layers layers;
+    const char *settings;
     size_t width, height, columns, latent; /* latent: frames of the grid that columns are chosen from */
     size_t result;                         /* row of it; after it ground truth and distance */
     uint8_t *truth, *map;                  /* [H, W, 3] */
@@ -75,9 +78,10 @@ static void draw_conditions(dar_output *o, const dar_condition *c, const dar_ten
     }
 }
 
-static dar_status begin_sheet(dar_output *o, const dar_condition *c, const dar_tensor *cond, const uint8_t *reference,
-                              dar_err *e)
+static dar_status begin_sheet(dar_output *o, const dar_output_shown *shown, dar_err *e)
 {
+    const dar_condition *c = shown->condition;
+    const dar_tensor *cond = shown->cond;
     char text[64];
     const char *slash = strrchr(o->dir.path, '/');
     o->result = 1 + (cond->data ? c->set.families : 0);
@@ -90,7 +94,7 @@ static dar_status begin_sheet(dar_output *o, const dar_condition *c, const dar_t
     plan.height = dar_most(1, plan.width * o->height / o->width);
     DAR_TRY(dar_sheet_init(&o->sheet, &plan, e));
     dar_sheet_row(&o->sheet, 0, "reference", "what it shall look like");
-    dar_sheet_picture(&o->sheet, 0, 0, reference, o->width, o->height, DAR_SHRINK_MEAN);
+    dar_sheet_picture(&o->sheet, 0, 0, shown->reference, o->width, o->height, DAR_SHRINK_MEAN);
     draw_conditions(o, c, cond);
     dar_sheet_row(&o->sheet, o->result, "result", NULL);
     if (o->b->rgb) {
@@ -121,40 +125,47 @@ static dar_status draw_result(dar_output *o, size_t column, size_t index, const 
 
 /* ---------------------------------------------------------------- files */
 
+static dar_status make_directory(const dar_output *o, const char *name, dar_err *e)
+{
+    char path[PATH_MAX];
+    DAR_TRY(member(o, name, path, e));
+    return mkdir(path, 0777) == 0 ? DAR_OK : dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
+}
+
 static dar_status begin_files(dar_output *o, dar_err *e)
 {
     static const char *const name[VIDEOS] = { "video.mp4", "video.mkv" };
     static const dar_video_codec codec[VIDEOS] = { DAR_VIDEO_H264, DAR_VIDEO_FFV1 };
     const bool wanted[VIDEOS] = { o->o.mp4, o->o.mkv };
     char path[PATH_MAX];
-    if (o->o.png) {
-        DAR_TRY(member(o, "frames", path, e));
-        if (mkdir(path, 0777) != 0) return dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
-    }
+    if (o->o.png) DAR_TRY(make_directory(o, "frames", e));
+    if (o->o.exr) DAR_TRY(make_directory(o, "exr", e));
+    if (o->o.exr) DAR_TRY(dar_layers_init(&o->layers, o->b, e));
     for (int i = 0; i < VIDEOS; i++) {
         if (!wanted[i]) continue;
         DAR_TRY(member(o, name[i], path, e));
-        DAR_TRY(dar_video_create(&o->video[i], path, o->width, o->height, o->b->meta.fps, codec[i], e));
+        dar_video_how how = { o->b->meta.fps, codec[i], o->settings };
+        DAR_TRY(dar_video_create(&o->video[i], path, o->width, o->height, &how, e));
     }
     return DAR_OK;
 }
 
-dar_status dar_output_create(dar_output **out, const char *path, dar_bundle *b, const dar_condition *condition,
-                             const dar_tensor *cond, const uint8_t *reference, const dar_output_options *options,
-                             dar_err *e)
+dar_status dar_output_create(dar_output **out, const char *path, dar_bundle *b, const dar_output_shown *shown,
+                             const char *settings, const dar_output_options *options, dar_err *e)
 {
     dar_output *o = calloc(1, sizeof *o);
     *out = NULL;
     if (!o) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
     o->o = *options;
     o->b = b;
+    o->settings = settings;
     o->width = (size_t)b->meta.width, o->height = (size_t)b->meta.height;
     o->truth = malloc(3 * o->width * o->height);
     o->map = malloc(3 * o->width * o->height);
     dar_status s = dar_dir_create(&o->dir, path, e);
     if (s == DAR_OK && !(o->truth && o->map)) s = dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
     if (s == DAR_OK) s = begin_files(o, e);
-    if (s == DAR_OK && o->o.sheet) s = begin_sheet(o, condition, cond, reference, e);
+    if (s == DAR_OK && o->o.sheet) s = begin_sheet(o, shown, e);
     if (s == DAR_OK) *out = o;
     else dar_output_discard(o);
     return s;
@@ -166,7 +177,12 @@ dar_status dar_output_frame(dar_output *o, size_t index, const uint8_t *rgb, dar
     if (o->o.png) {
         snprintf(name, sizeof name, "frames/%05zu.png", index);
         DAR_TRY(member(o, name, path, e));
-        DAR_TRY(dar_png_write(path, o->width, o->height, 3, rgb, e));
+        DAR_TRY(dar_png_save(path, &(dar_png){ o->width, o->height, 3, rgb, o->settings }, e));
+    }
+    if (o->o.exr) {
+        snprintf(name, sizeof name, "exr/%05zu.exr", index);
+        DAR_TRY(member(o, name, path, e));
+        DAR_TRY(dar_layers_write(&o->layers, path, o->b, index, rgb, o->settings, e));
     }
     for (int i = 0; i < VIDEOS; i++)
         if (o->video[i]) DAR_TRY(dar_video_write(o->video[i], rgb, e));
@@ -186,7 +202,7 @@ static dar_status write_text(const char *path, const char *text, dar_err *e)
     return s;
 }
 
-dar_status dar_output_commit(dar_output *o, const char *settings, dar_err *e)
+dar_status dar_output_commit(dar_output *o, dar_err *e)
 {
     char path[PATH_MAX];
     for (int i = 0; i < VIDEOS; i++)
@@ -196,7 +212,7 @@ dar_status dar_output_commit(dar_output *o, const char *settings, dar_err *e)
         DAR_TRY(dar_sheet_write(&o->sheet, path, e));
     }
     DAR_TRY(member(o, "sample.json", path, e));
-    DAR_TRY(write_text(path, settings, e));
+    DAR_TRY(write_text(path, o->settings, e));
     return dar_dir_commit(&o->dir, o->o.overwrite, e);
 }
 
@@ -206,6 +222,7 @@ void dar_output_discard(dar_output *o)
     for (int i = 0; i < VIDEOS; i++) dar_video_close(o->video[i]);
     dar_dir_discard(&o->dir);
     dar_sheet_free(&o->sheet);
+    dar_layers_free(&o->layers);
     free(o->truth);
     free(o->map);
     free(o);

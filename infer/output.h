@@ -2,11 +2,13 @@
  *
  *   sample.json        how it was made: the same input gives the same text, so it also tells whether the work is done
  *   frames/00000.png   every frame
+ *   exr/00000.exr      every frame with depth, matte and ids, for compositing (infer/layers.h)
  *   video.mp4          for people
  *   video.mkv          every frame, exact (FFV1)
  *   sheet.png          reference, geometry as the network sees it, result, ground truth and distance from it
  *
- * It appears whole or not at all (lib/dir.h). */
+ * Pictures, videos and EXR files carry the text of sample.json as their comment.  The directory appears whole or not at
+ * all (lib/dir.h). */
 #ifndef DAR_INFER_OUTPUT_H
 #define DAR_INFER_OUTPUT_H
 
@@ -14,22 +16,29 @@
 #include "models/model.h"
 
 typedef struct dar_output_options {
-    bool png, mp4, mkv, sheet;
+    bool png, exr, mp4, mkv, sheet;
     bool overwrite;
 } dar_output_options;
 
+/* What the sheet shows beside the result. */
+typedef struct dar_output_shown {
+    const dar_condition *condition;
+    const dar_tensor *cond;
+    const uint8_t *reference;
+} dar_output_shown;
+
 typedef struct dar_output dar_output;
 
-/* Begin.  b, which is read for ground truth, must outlive it; reference [H, W, 3]; cond as the pipeline has it, data
- * NULL: none.  On failure *out is NULL. */
-dar_status dar_output_create(dar_output **out, const char *path, dar_bundle *b, const dar_condition *condition,
-                             const dar_tensor *cond, const uint8_t *reference, const dar_output_options *o, dar_err *e);
+/* Begin.  b, which is read for ground truth and layers, and settings must outlive it; reference [H, W, 3]; cond as the
+ * pipeline has it, data NULL: none.  On failure *out is NULL. */
+dar_status dar_output_create(dar_output **out, const char *path, dar_bundle *b, const dar_output_shown *shown,
+                             const char *settings, const dar_output_options *o, dar_err *e);
 
 /* The next frame, rgb [H, W, 3]. */
 dar_status dar_output_frame(dar_output *o, size_t index, const uint8_t *rgb, dar_err *e);
 
 /* All are there: finish the files, write sample.json, rename. */
-dar_status dar_output_commit(dar_output *o, const char *settings, dar_err *e);
+dar_status dar_output_commit(dar_output *o, dar_err *e);
 
 /* Accepts NULL.  What was not committed is removed. */
 void dar_output_discard(dar_output *o);

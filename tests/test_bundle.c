@@ -655,7 +655,7 @@ static void blender(void **state)
     const char *path = in_dir("blender.exr");
     dar_exr *x;
     dar_err e;
-    ok(dar_exr_write(path, 2, 2, plane, DAR_COUNT(plane), DAR_EXR_ZIP, &e), &e);
+    ok(dar_exr_write(path, 2, 2, plane, DAR_COUNT(plane), &(dar_exr_how){ DAR_EXR_ZIP, NULL }, &e), &e);
     ok(dar_exr_open(&x, path, &e), &e);
     unsigned expected = 1u << DAR_FAMILY_DEPTH | 1u << DAR_BUNDLE_ID | 1u << DAR_FAMILY_NORMAL |
                         1u << DAR_FAMILY_TRACKING | 1u << DAR_FAMILY_MASK;

@@ -7,8 +7,11 @@
 #include <time.h>
 
 #include "data/bundle.h"
+#include "data/pictures.h"
 #include "data/png.h"
+#include "data/srgb.h"
 #include "data/video.h"
+#include "lib/dtype.h"
 #include "lib/json.h"
 #include "lib/rng.h"
 #include "lib/safetensors_write.h"
@@ -158,7 +161,8 @@ static double printed_in(const char *object, const char *key)
     return x;
 }
 
-static void same_frames(const char *a, const char *b)
+/* Frames, with what they say of how they were made. */
+static void same_files(const char *a, const char *b)
 {
     char x[128], y[128];
     for (int t = 0; t < T; t++) {
@@ -168,18 +172,26 @@ static void same_frames(const char *a, const char *b)
     }
 }
 
+static bool same_picture(const char *a, const char *b, int t)
+{
+    static uint8_t rgb[2][3 * PIXELS];
+    char path[128];
+    dar_err e;
+    for (int i = 0; i < 2; i++) {
+        snprintf(path, sizeof path, "%s/frames/%05d.png", i ? b : a, t);
+        CHECK(dar_pictures_load(path, W, H, rgb[i], &e) == DAR_OK, "%s", e.text);
+    }
+    return memcmp(rgb[0], rgb[1], sizeof rgb[0]) == 0;
+}
+
+static void same_frames(const char *a, const char *b)
+{
+    for (int t = 0; t < T; t++) CHECK(same_picture(a, b, t), "frame %d of %s and %s", t, a, b);
+}
+
 static bool frames_differ(const char *a, const char *b)
 {
-    char x[128], y[128];
-    dar_file_map m, n;
-    snprintf(x, sizeof x, "%s/frames/%05d.png", a, T - 1);
-    snprintf(y, sizeof y, "%s/frames/%05d.png", b, T - 1);
-    assert_int_equal(dar_file_map_open(&m, x, NULL), DAR_OK);
-    assert_int_equal(dar_file_map_open(&n, y, NULL), DAR_OK);
-    bool same = m.size == n.size && memcmp(m.data, n.data, m.size) == 0;
-    dar_file_map_close(&m);
-    dar_file_map_close(&n);
-    return !same;
+    return !same_picture(a, b, T - 1);
 }
 
 /* ---------------------------------------------------------------- tests */
@@ -218,8 +230,8 @@ static void any_threads(void **state)
     GOOD("clip", "-o", "t1", MODEL, "--reference", "a.png", "--threads", "1");
     GOOD("clip", "-o", "t2", MODEL, "--reference", "a.png", "--threads", "2");
     GOOD("clip", "-o", "t3", MODEL, "--reference", "a.png", "--threads", "3");
-    same_frames("t1", "t2");
-    same_frames("t1", "t3");
+    same_files("t1", "t2");
+    same_files("t1", "t3");
     run_same_file("t1/sample.json", "t2/sample.json");
     GOOD("clip", "-o", "t4", MODEL, "--reference", "a.png", "--seed", "43");
     assert_true(frames_differ("t1", "t4"));
@@ -237,7 +249,7 @@ static void batches(void **state)
     GOOD("clip", "seen", "-o", "all", MODEL, "--reference", "a.png", "b.png", "--json");
     CHECK_NEAR("done", printed("done"), 4, 0);
     GOOD("clip", "-o", "alone", MODEL, "--reference", "b.png");
-    same_frames("all/clip-b", "alone");
+    same_files("all/clip-b", "alone");
     run_same_file("all/clip-b/sample.json", "alone/sample.json");
     assert_true(frames_differ("all/clip-a", "all/clip-b"));
 
@@ -266,7 +278,7 @@ static void stopped(void **state)
         if (status) assert_false(run_is_there("cut/sample.json"));
     }
     GOOD("seen", "-o", "cut", "--model", "model", "--steps", "60", "--no-mp4");
-    same_frames("whole", "cut");
+    same_files("whole", "cut");
     run_same_file("whole/sample.json", "cut/sample.json");
 }
 
@@ -342,7 +354,7 @@ static void ten_clips(void **state)
     for (size_t i = 0; i < CLIPS; i++) {
         clip_path(a, "straight", i, "");
         clip_path(b, "ten", i, "");
-        same_frames(a, b);
+        same_files(a, b);
         clip_path(a, "straight", i, "/sheet.png");
         clip_path(b, "ten", i, "/sheet.png");
         run_same_file(a, b);
@@ -388,6 +400,62 @@ static void solvers_and_noise(void **state)
     assert_true(frames_differ("told", "t1") && frames_differ("told", "told1"));
     same_frames("equal", "told1");
     dar_arena_free(&a);
+}
+
+static bool holds(const char *path, const char *words)
+{
+    dar_file_map m;
+    assert_int_equal(dar_file_map_open(&m, path, NULL), DAR_OK);
+    bool there = memmem(m.data, m.size, words, strlen(words)) != NULL;
+    dar_file_map_close(&m);
+    return there;
+}
+
+/* Colour of the render in linear light, the bundle's depth, matte and ids; how it was made in every file. */
+static void layers(void **state)
+{
+    (void)state;
+    static float depth[PIXELS], own[PIXELS], mask[PIXELS];
+    static uint32_t id[PIXELS];
+    static uint16_t half[PIXELS];
+    static uint8_t rgb[3 * PIXELS];
+    dar_bundle *b;
+    dar_exr *x;
+    dar_srgb srgb;
+    dar_err e;
+    size_t covered = 0;
+    GOOD("clip", "-o", "comp", "--model", "model", "--steps", "2", "--reference", "a.png", "--exr", "--mkv");
+    static const char *const files[] = { "frames/00000.png", "exr/00008.exr", "video.mp4", "video.mkv" };
+    for (size_t i = 0; i < DAR_COUNT(files); i++) {
+        char path[64];
+        snprintf(path, sizeof path, "comp/%s", files[i]);
+        CHECK(holds(path, "\"made_by\": \"dar-sample"), "%s does not tell how it was made", path);
+    }
+    dar_srgb_init(&srgb);
+    assert_int_equal(dar_pictures_load("comp/frames/00004.png", W, H, rgb, &e), DAR_OK);
+    assert_int_equal(dar_bundle_open(&b, "clip", &e), DAR_OK);
+    CHECK(dar_exr_open(&x, "comp/exr/00004.exr", &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_exr_channels(x), 6);
+    for (size_t c = 0; c < 4; c++) {
+        assert_int_equal(
+            dar_exr_read(x, (size_t)dar_exr_find(x, "", (const char *[]){ "R", "G", "B", "A" }[c]), half, &e), DAR_OK);
+        assert_int_equal(dar_bundle_values(b, DAR_FAMILY_MASK, 4, mask, &e), DAR_OK);
+        for (size_t i = 0; i < PIXELS; i++) {
+            double y = c < 3 ? (double)srgb.linear[rgb[3 * i + c]] : (double)mask[i];
+            CHECK_NEAR("half", dar_dtype_get(DAR_F16, half, i), y, y / 2048 + 1e-7);
+        }
+    }
+    assert_int_equal(dar_exr_read(x, (size_t)dar_exr_find(x, "depth", "Z"), depth, &e), DAR_OK);
+    assert_int_equal(dar_bundle_values(b, DAR_FAMILY_DEPTH, 4, own, &e), DAR_OK);
+    assert_memory_equal(depth, own, sizeof depth);
+    assert_int_equal(dar_exr_read(x, (size_t)dar_exr_find(x, "id", "X"), id, &e), DAR_OK);
+    for (size_t i = 0; i < PIXELS; i++) {
+        CHECK((id[i] != 0) == (depth[i] > 0), "pixel %zu", i);
+        covered += id[i] != 0;
+    }
+    CHECK(covered > PIXELS / 20, "only %zu pixels", covered);
+    dar_exr_close(x);
+    dar_bundle_close(b);
 }
 
 /* One window is the plain run; several are another video, whatever the threads. */
@@ -467,9 +535,10 @@ static int remove_directory(void **state)
 int main(int argc, char **argv)
 {
     static const struct CMUnitTest tests[] = {
-        cmocka_unit_test(a_video), cmocka_unit_test(any_threads), cmocka_unit_test(batches),
-        cmocka_unit_test(stopped), cmocka_unit_test(ten_clips),   cmocka_unit_test(solvers_and_noise),
-        cmocka_unit_test(windows), cmocka_unit_test(dry_run),     cmocka_unit_test(refusals),
+        cmocka_unit_test(a_video),  cmocka_unit_test(any_threads), cmocka_unit_test(batches),
+        cmocka_unit_test(stopped),  cmocka_unit_test(ten_clips),   cmocka_unit_test(solvers_and_noise),
+        cmocka_unit_test(layers),   cmocka_unit_test(windows),     cmocka_unit_test(dry_run),
+        cmocka_unit_test(refusals),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
     return cmocka_run_group_tests_name("dar-sample", tests, in_directory, remove_directory) != 0;

@@ -38,7 +38,9 @@ static void round_trip(void **state)
     dar_exr *x;
     fill();
     for (int c = DAR_EXR_NONE; c <= DAR_EXR_PXR24; c++) {
-        ok(dar_exr_write(path, W, H, planes, DAR_COUNT(planes), (dar_exr_compression)c, &e), &e);
+        ok(dar_exr_write(path, W, H, planes, DAR_COUNT(planes),
+                         &(dar_exr_how){ (dar_exr_compression)c, "how it was made" }, &e),
+           &e);
         ok(dar_exr_open(&x, path, &e), &e);
         CHECK(dar_exr_width(x) == W && dar_exr_height(x) == H, "size %zux%zu", dar_exr_width(x), dar_exr_height(x));
         CHECK(dar_exr_channels(x) == DAR_COUNT(planes), "%zu channels", dar_exr_channels(x));
@@ -81,7 +83,7 @@ static void names(void **state)
     dar_err e;
     dar_exr *x;
     fill();
-    ok(dar_exr_write(path, W, H, planes, DAR_COUNT(planes), DAR_EXR_ZIP, &e), &e);
+    ok(dar_exr_write(path, W, H, planes, DAR_COUNT(planes), &(dar_exr_how){ DAR_EXR_ZIP, NULL }, &e), &e);
     ok(dar_exr_open(&x, path, &e), &e);
     for (size_t i = 0; i < DAR_COUNT(row); i++) {
         int k = dar_exr_find(x, row[i].pass, row[i].component);
@@ -154,7 +156,7 @@ static void cut(void **state)
     dar_err e;
     dar_exr *x;
     fill();
-    ok(dar_exr_write(path, W, H, planes, 1, DAR_EXR_ZIP, &e), &e);
+    ok(dar_exr_write(path, W, H, planes, 1, &(dar_exr_how){ DAR_EXR_ZIP, NULL }, &e), &e);
     ok(dar_file_map_open(&m, path, &e), &e);
     for (size_t n = 0; n < m.size; n += 13) {
         unsigned char *part = malloc(n + 1); /* exact, so that a byte read past it is seen */
