@@ -1,10 +1,12 @@
 /* plot.h: lines and points as a picture: SVG that needs nothing else.
  *
- *     dar_plot p = { .title = "Loss", .x = { "step" }, .y = { "loss", .log = true }, .series = s, .n = 2 };
+ *     dar_plot_series s = { .label = "mean of 100", .n = n, .x = step, .y = loss };
+ *     dar_plot p = { .title = "Loss", .x.label = "step", .y.log = true, .series = &s, .n = 1 };
  *     DAR_TRY(dar_plot_write(&p, "loss.svg", e));
  *
- * Axes reach from the least to the largest value; ticks are round numbers.  What is not finite, or not positive on a
- * logarithmic axis, is left out, and a line has a gap there.  Same input, same bytes. */
+ * Axes hold all that is drawn, with round numbers at their ticks.  What is not finite, or not positive on a logarithmic
+ * axis, is left out, and a line has a gap there.  Lines and clouds of many points are thinned to what can be seen.
+ * Same input, same bytes. */
 #ifndef DAR_LIB_PLOT_H
 #define DAR_LIB_PLOT_H
 
@@ -18,12 +20,13 @@ typedef enum dar_plot_mark { DAR_PLOT_LINE, DAR_PLOT_POINTS, DAR_PLOT_BOTH } dar
 typedef struct dar_plot_series {
     const char *label; /* in the legend; NULL: not there */
     dar_plot_mark mark;
-    bool faint; /* pale and thin, below the others: what they are the mean of */
-    int colour; /* of a palette of eight; more repeat */
+    int colour; /* 0, 1, ... of a palette of eight, which repeats */
+    bool faint; /* pale and thin: what others are the mean of; list it before them */
     size_t n;
     const double *x, *y;
-    const double *lo, *hi;   /* ends of error bars; NULL: none */
-    const char *const *tips; /* what is said when a point is pointed at; NULL: its numbers */
+    const double *lo, *hi;    /* ends of error bars, of a band for DAR_PLOT_LINE; NULL: none */
+    const char *const *names; /* written beside the points; NULL: none */
+    const char *const *tips;  /* told where a point is pointed at; NULL: its name, if any, and its numbers */
 } dar_plot_series;
 
 typedef struct dar_plot_axis {
