@@ -2,11 +2,14 @@
 #include "lib/thread.h"
 
 #include <omp.h>
-
-#include "lib/status.h"
+#include <pthread.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <string.h>
 
 static _Atomic int wanted; /* 0: not known yet */
 static _Thread_local int self;
+static _Thread_local bool beside;
 
 int dar_threads(void)
 {
@@ -22,14 +25,14 @@ void dar_threads_set(int n)
 
 bool dar_in_task(void)
 {
-    return omp_in_parallel();
+    return beside || omp_in_parallel();
 }
 
 void dar_parallel(size_t tasks, dar_task *fn, void *ctx)
 {
     int n = dar_threads();
 
-    if (n == 1 || tasks <= 1 || omp_in_parallel()) {
+    if (n == 1 || tasks <= 1 || dar_in_task()) {
         for (size_t i = 0; i < tasks; i++) fn(ctx, i, self);
         return;
     }
@@ -41,6 +44,46 @@ void dar_parallel(size_t tasks, dar_task *fn, void *ctx)
         for (size_t i = 0; i < tasks; i++) fn(ctx, i, self);
         self = 0;
     }
+}
+
+struct dar_thread {
+    pthread_t id;
+    void (*fn)(void *);
+    void *ctx;
+};
+
+static void *run_beside(void *arg)
+{
+    const struct dar_thread *t = arg;
+    beside = true;
+    t->fn(t->ctx);
+    return NULL;
+}
+
+dar_status dar_thread_start(dar_thread **out, void (*fn)(void *), void *ctx, dar_err *e)
+{
+    sigset_t all, old;
+    dar_thread *t = malloc(sizeof *t);
+    *out = NULL;
+    if (!t) return dar_fail(e, DAR_ERR_NOMEM, "a thread: out of memory");
+    *t = (dar_thread){ .fn = fn, .ctx = ctx };
+    sigfillset(&all);
+    pthread_sigmask(SIG_SETMASK, &all, &old); /* the new thread inherits it */
+    int failed = pthread_create(&t->id, NULL, run_beside, t);
+    pthread_sigmask(SIG_SETMASK, &old, NULL);
+    if (failed) {
+        free(t);
+        return dar_fail(e, DAR_ERR_NOMEM, "a thread: %s", strerror(failed));
+    }
+    *out = t;
+    return DAR_OK;
+}
+
+void dar_thread_join(dar_thread *t)
+{
+    if (!t) return;
+    pthread_join(t->id, NULL);
+    free(t);
 }
 
 struct range {

@@ -8,6 +8,8 @@
 #include <stdbool.h>
 #include <stddef.h>
 
+#include "lib/status.h"
+
 /* Threads that dar_parallel uses.  The default is the number of processors, or OMP_NUM_THREADS. */
 int dar_threads(void);
 void dar_threads_set(int n); /* n >= 1 */
@@ -17,8 +19,15 @@ void dar_threads_set(int n); /* n >= 1 */
 typedef void dar_task(void *ctx, size_t i, int thread);
 void dar_parallel(size_t tasks, dar_task *fn, void *ctx);
 
-/* Whether the caller is a task on one of several threads. */
+/* Whether the caller is a task on one of several threads, or a thread beside. */
 bool dar_in_task(void);
+
+/* A thread beside the others, such as one that reads ahead: it runs fn(ctx), and in it dar_parallel runs in place, so
+ * that it takes no processor from the work it serves but its own.  Signals go to the others.  On failure *out is NULL;
+ * every other one is owed a join, which waits for fn to return and accepts NULL. */
+typedef struct dar_thread dar_thread;
+dar_status dar_thread_start(dar_thread **out, void (*fn)(void *ctx), void *ctx, dar_err *e);
+void dar_thread_join(dar_thread *t);
 
 /* Cut n items in chunks of `chunk` and run fn(ctx, begin, end, thread) on each. */
 typedef void dar_range_task(void *ctx, size_t begin, size_t end, int thread);
