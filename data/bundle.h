@@ -49,6 +49,7 @@
 #include "data/raster.h"
 #include "data/trajectory.h"
 #include "data/world.h"
+#include "lib/sha256.h"
 #include "lib/status.h"
 
 #define DAR_BUNDLE_FORMAT     "dar-bundle/1"
@@ -139,6 +140,9 @@ dar_status dar_bundle_tracks(dar_bundle *b, float *xy, uint8_t *visible, uint8_t
 
 /* Path of a member of the bundle: "text.safetensors". */
 const char *dar_bundle_path(const dar_bundle *b, const char *member, char path[PATH_MAX]);
+
+/* sha256 of a file of the bundle as meta.json has it; else computed. */
+dar_status dar_bundle_sum(const dar_bundle *b, const char *member, char sum[DAR_SHA256_TEXT], dar_err *e);
 
 /* What dar_condition_build wants of this bundle; checks that all that `c` needs is there.  Lives as long as b. */
 dar_status dar_bundle_source(dar_bundle *b, const dar_condition *c, dar_condition_source *s, dar_err *e);

@@ -390,6 +390,18 @@ dar_status dar_bundle_source(dar_bundle *b, const dar_condition *c, dar_conditio
 
 /* ---------------------------------------------------------------- whether files are those that were written */
 
+dar_status dar_bundle_sum(const dar_bundle *b, const char *member, char sum[DAR_SHA256_TEXT], dar_err *e)
+{
+    const dar_bundle_contents *c = &b->in->c;
+    char path[PATH_MAX];
+    for (size_t i = 0; i < c->files; i++) {
+        if (!*c->file[i].sha256 || strcmp(c->file[i].name, member) != 0) continue;
+        memcpy(sum, c->file[i].sha256, DAR_SHA256_TEXT);
+        return DAR_OK;
+    }
+    return dar_sha256_file(dar_bundle_path(b, member, path), sum, e);
+}
+
 dar_status dar_bundle_verify(dar_bundle *b, dar_err *e)
 {
     const dar_bundle_contents *c = &b->in->c;
