@@ -7,58 +7,26 @@
 #include <unistd.h>
 
 #include "data/rays.h"
+#include "models/encode.h"
+#include "models/load.h"
 
 /* ---------------------------------------------------------------- what comes from files */
-
-static bool is_zero_row(const dar_tensor *x, int64_t row)
-{
-    int64_t n = x->shape.d[2];
-    for (int64_t i = 0; i < n; i++)
-        if (dar_dtype_get(x->dtype, x->data, (size_t)(row * n + i)) != 0) return false;
-    return true;
-}
-
-/* A tensor of the file as [1, n, text width]; zeros at its end, which tools like to fill up with, are no tokens. */
-static dar_status read_text(dar_pipeline *p, dar_weights *f, const char *path, const char *name, dar_tensor *x,
-                            dar_err *e)
-{
-    const dar_dit_config *c = &p->m->c.dit;
-    char found[96];
-    DAR_TRY(dar_weights_tensor(f, name, x, e));
-    int n = x->shape.n;
-    if (!(n == 2 || (n == 3 && x->shape.d[0] == 1)) || x->shape.d[n - 1] != c->text_width ||
-        x->shape.d[n - 2] > c->text_keys)
-        return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found %s, expected [n, %lld], n at most %lld", path, name,
-                        dar_shape_text(&x->shape, found, sizeof found), (long long)c->text_width,
-                        (long long)c->text_keys);
-    int64_t rows = x->shape.d[n - 2];
-    *x = dar_tensor_reshape(x, DAR_SHAPE(1, rows, c->text_width));
-    while (rows > 0 && is_zero_row(x, rows - 1)) rows--;
-    if (rows == 0) *x = (dar_tensor){ 0 };
-    else *x = dar_tensor_of(x->dtype, DAR_SHAPE(1, rows, c->text_width), x->data);
-    return DAR_OK;
-}
-
-static const char *only_tensor(const dar_weights *f, const char *name)
-{
-    if (!dar_weights_find(f, name) && dar_weights_count(f) == 1) return dar_weights_at(f, 0)->name;
-    return name;
-}
 
 static dar_status read_prompts(dar_pipeline *p, dar_err *e)
 {
     char own[PATH_MAX];
+    const dar_dit_config *c = &p->m->c.dit;
     const char *path = p->o.text, *other = p->o.negative;
     if (!path && p->b->text) path = dar_bundle_path(p->b, "text.safetensors", own);
     if (path) {
         DAR_TRY(dar_weights_open(&p->text[0], path, e));
-        DAR_TRY(read_text(p, p->text[0], path, only_tensor(p->text[0], "text"), &p->words[0], e));
+        DAR_TRY(dar_load_text(c, p->text[0], path, "text", &p->words[0], e));
         if (!other && dar_weights_find(p->text[0], "negative"))
-            DAR_TRY(read_text(p, p->text[0], path, "negative", &p->words[1], e));
+            DAR_TRY(dar_load_text(c, p->text[0], path, "negative", &p->words[1], e));
     }
     if (!other) return DAR_OK;
     DAR_TRY(dar_weights_open(&p->text[1], other, e));
-    return read_text(p, p->text[1], other, only_tensor(p->text[1], "negative"), &p->words[1], e);
+    return dar_load_text(c, p->text[1], other, "negative", &p->words[1], e);
 }
 
 static dar_shape latent_shape(const dar_pipeline *p)
@@ -146,17 +114,18 @@ static dar_status tell(const dar_pipeline_listener *l, dar_pipeline_stage stage,
     return l && l->told ? l->told(l->ctx, stage, (size_t)done, (size_t)of, e) : DAR_OK;
 }
 
-/* Pixels [1, 3, n, H, W] of the known video: the picture, or grey. */
-static void write_pixels(const dar_tensor *x, const uint8_t *rgb)
+struct known {
+    const uint8_t *rgb;
+    const dar_pipeline_listener *l;
+    int64_t pieces;
+};
+
+/* The picture, then grey. */
+static dar_status known_pixels(void *ctx, int64_t piece, const dar_tensor *x, dar_err *e)
 {
-    size_t pixels = dar_tensor_count(x) / 3;
-    if (!rgb) {
-        dar_tensor_fill(x, 0);
-        return;
-    }
-    for (size_t k = 0; k < 3; k++)
-        for (size_t i = 0; i < pixels; i++)
-            dar_dtype_set(x->dtype, x->data, k * pixels + i, rgb[3 * i + k] / 127.5 - 1);
+    const struct known *k = ctx;
+    for (int64_t f = 0; f < x->shape.d[2]; f++) dar_encode_frame(x, f, piece ? NULL : k->rgb);
+    return piece ? tell(k->l, DAR_PIPELINE_ENCODE, piece, k->pieces, e) : DAR_OK;
 }
 
 /* The latent of the known video; without mask channels that of its first frame is all that is wanted. */
@@ -164,24 +133,19 @@ static dar_status encode(dar_pipeline *p, const uint8_t *rgb, const dar_tensor *
                          dar_err *e)
 {
     const dar_vae *v = &p->m->vae;
-    const int64_t F = p->m->c.dit.mask ? p->frames : 1;
-    const int64_t H = p->height * dar_vae_shrink(&v->c), W = p->width * dar_vae_shrink(&v->c);
+    const int64_t F = p->m->c.dit.mask ? p->frames : 1, C = latent->shape.d[1];
+    const bool skip = p->o.sampler.skip >> DAR_SKIP_REPEAT & 1;
+    struct known known = { rgb, l, F };
     dar_mark kept = dar_arena_mark(&p->kept);
-    dar_status s = DAR_OK;
-    dar_vae_stream stream;
-    dar_vae_stream_init(&stream, v, DAR_VAE_ENCODER, &p->kept);
-    stream.skip = p->o.sampler.skip >> DAR_SKIP_REPEAT & 1;
-    for (int64_t f = 0; f < F && s == DAR_OK; f++) {
-        dar_tape_place begin = dar_tape_mark(&p->tape);
-        dar_val *x = dar_input(&p->tape, v->main, DAR_SHAPE(1, 3, f ? DAR_RAYS_GROUP : 1, H, W));
-        if (!plans(p)) write_pixels(&x->x, f ? NULL : rgb);
-        dar_val *y = dar_vae_mean(&p->tape, v, dar_vae_encode_next(&stream, &p->tape, x));
-        y = dar_vae_normalise(&p->tape, v, y);
-        dar_tensor to = dar_tensor_narrow(latent, 2, f, 1);
-        if (!plans(p)) dar_tensor_copy(&to, &y->x);
-        dar_tape_reset(&p->tape, begin);
-        s = tell(l, DAR_PIPELINE_ENCODE, f + 1, F, e);
-    }
+    dar_tensor moments = dar_tensor_push(&p->kept, v->main, DAR_SHAPE(1, 2 * C, F, p->height, p->width));
+    dar_status s = dar_encode_clip(&p->tape, v, &p->kept, skip, known_pixels, &known, &moments, e);
+    if (s == DAR_OK) s = tell(l, DAR_PIPELINE_ENCODE, F, F, e);
+
+    dar_tape_place begin = dar_tape_mark(&p->tape);
+    dar_val *y = dar_vae_normalise(&p->tape, v, dar_vae_mean(&p->tape, v, dar_leaf(&p->tape, moments, NULL)));
+    dar_tensor to = dar_tensor_narrow(latent, 2, 0, F);
+    if (!plans(p)) dar_tensor_copy(&to, &y->x);
+    dar_tape_reset(&p->tape, begin);
     dar_arena_reset(&p->kept, kept);
     return s;
 }

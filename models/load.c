@@ -271,3 +271,33 @@ dar_status dar_load_vae(dar_params *p, dar_weights *w, dar_err *e)
     loading l = { .p = p, .w = w, .roles = DAR_PARAM_ALL };
     return load(&l, renames, DAR_COUNT(renames), e);
 }
+
+/* ---------------------------------------------------------------- prompts */
+
+static bool is_zero_row(const dar_tensor *x, int64_t row)
+{
+    int64_t n = x->shape.d[2];
+    for (int64_t i = 0; i < n; i++)
+        if (dar_dtype_get(x->dtype, x->data, (size_t)(row * n + i)) != 0) return false;
+    return true;
+}
+
+dar_status dar_load_text(const dar_dit_config *c, dar_weights *w, const char *path, const char *name, dar_tensor *x,
+                         dar_err *e)
+{
+    char found[96];
+    if (!dar_weights_find(w, name) && dar_weights_count(w) == 1) name = dar_weights_at(w, 0)->name;
+    DAR_TRY(dar_weights_tensor(w, name, x, e));
+    int n = x->shape.n;
+    if (!(n == 2 || (n == 3 && x->shape.d[0] == 1)) || x->shape.d[n - 1] != c->text_width ||
+        x->shape.d[n - 2] > c->text_keys)
+        return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found %s, expected [n, %lld], n at most %lld", path, name,
+                        dar_shape_text(&x->shape, found, sizeof found), (long long)c->text_width,
+                        (long long)c->text_keys);
+    int64_t rows = x->shape.d[n - 2];
+    *x = dar_tensor_reshape(x, DAR_SHAPE(1, rows, c->text_width));
+    while (rows > 0 && is_zero_row(x, rows - 1)) rows--;
+    if (rows == 0) *x = (dar_tensor){ 0 };
+    else *x = dar_tensor_of(x->dtype, DAR_SHAPE(1, rows, c->text_width), x->data);
+    return DAR_OK;
+}

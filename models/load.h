@@ -25,6 +25,12 @@ dar_status dar_load_adapter(dar_dit *m, dar_params *p, dar_weights *w, uint64_t 
 /* Into a table that dar_vae_init, or dar_taew_init, filled and nobody else. */
 dar_status dar_load_vae(dar_params *p, dar_weights *w, dar_err *e);
 
+/* An embedding [n, text width], n at most text_keys, a 1 before it or not, as x [1, n, text width], a view of the file.
+ * The only tensor of a file may have any name.  Zeros at the end, which tools like to fill up with, are no tokens; with
+ * none left x->data is NULL.  `path` stands for the file in messages. */
+dar_status dar_load_text(const dar_dit_config *c, dar_weights *w, const char *path, const char *name, dar_tensor *x,
+                         dar_err *e);
+
 /* The name that a parameter has in diffusers: of the transformer, of the autoencoder. */
 void dar_load_diffusers_dit(const char *name, char *out, size_t size);
 void dar_load_diffusers_vae(const char *name, char *out, size_t size);
