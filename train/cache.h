@@ -18,7 +18,7 @@
 typedef struct dar_cache dar_cache;
 
 /* Name the entries of an autoencoder whose parameters p have their values.  v must outlive it.  The directory is made
- * with the first entry.  On failure *out is NULL. */
+ * with the first entry.  Of parameters on a planning arena only sizes can be asked.  On failure *out is NULL. */
 dar_status dar_cache_open(dar_cache **out, const char *dir, const dar_vae *v, const dar_params *p, dar_err *e);
 void dar_cache_close(dar_cache *c); /* accepts NULL */
 

@@ -67,7 +67,7 @@ size_t dar_loader_bytes(const dar_loader *l);     /* of memory, all batches toge
 double dar_loader_waited(const dar_loader *l);    /* [s] in dar_loader_get, so far */
 dar_shape dar_loader_latent(const dar_loader *l); /* [B, C, F, h, w]; n = 0 without cache */
 
-/* Number of the clip at a place of the sequence. */
-size_t dar_loader_order(uint64_t seed, size_t clips, uint64_t place, bool shuffle);
+/* Numbers of the clips of an epoch, in order. */
+void dar_loader_order(uint64_t seed, uint64_t epoch, size_t clips, size_t *order);
 
 #endif
