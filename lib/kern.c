@@ -18,6 +18,7 @@ void dar_kern_init(unsigned cpu_flags)
     dar_kern_ref_f64(&f64);
     if (cpu_flags & DAR_CPU_AVX2) dar_kern_avx2(&f32);
     if (cpu_flags & DAR_CPU_AVX512) dar_kern_avx512(&f32);
+    if (cpu_flags & DAR_CPU_BF16) dar_kern_bf16(&f32);
     for (int i = 0; i < 2; i++) {
         dar_kern *k = i ? &f64 : &f32;
         dar_kern_move_ref(k);

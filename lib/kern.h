@@ -56,7 +56,7 @@ typedef void dar_kern_map(size_t n, const void *x, void *y);
 typedef void dar_kern_map_back(size_t n, const void *x, const void *gy, void *gx);
 
 typedef struct dar_kern {
-    const char *name; /* of the fastest set used: "ref", "avx2", "avx512" */
+    const char *name; /* of the fastest set used: "ref", "avx2", "avx512", "bf16" */
 
     /* Bits, whatever they mean; the same in both tables.  transpose, by stored type (i8 is NULL): y[j ldy + i] =
      * x[i ldx + j] for i < m, j < n.  stream: copy past the caches, at any alignment. */
@@ -97,11 +97,13 @@ typedef struct dar_kern {
     /* Norms, by stored type of x, i8 NULL.
      *
      *   moments      m[0] = the mean if `centred`, else 0; m[1] = Σ (x - m[0])^2, as sums of differences from x[0],
-     * which lose at most a factor n, their squares fused with the sum; not centred: of x itself norm         y = xhat w
-     * + b, stored as y_type norm_sums    sum[0] += Σ w gy, sum[1] += Σ w gy xhat; gw += gy xhat, gb += gy where they
-     * are not NULL norm_back    gx = rstd (w gy - mean[0] - xhat mean[1])
+     *                which lose at most a factor n, their squares fused with the sum; not centred: of x itself.  bf16:
+     *                within 2^-16, by way of runs of 8 elements in the table's type (lib/kern_sets.h)
+     *   norm         y = xhat w + b, stored as y_type
+     *   norm_sums    sum[0] += Σ w gy, sum[1] += Σ w gy xhat; gw += gy xhat, gb += gy where they are not NULL
+     *   norm_back    gx = rstd (w gy - mean[0] - xhat mean[1])
      *
-     * stream, here and below: write past the caches where y or gx is aligned as vectors are. */
+     * stream, here and below: write past the caches where y or gx is aligned as cache lines are. */
     void (*moments[DAR_DTYPES])(size_t n, const void *x, bool centred, double m[2]);
     void (*norm[DAR_DTYPES])(size_t n, const dar_norm *s, const void *x, dar_dtype y_type, void *y, bool stream);
     void (*norm_sums[DAR_DTYPES])(size_t n, const dar_norm *s, const void *x, const void *gy, double sum[2], void *gw,
@@ -122,9 +124,10 @@ typedef struct dar_kern {
     double (*column_back[DAR_DTYPES])(size_t n, double w, const void *r, const void *q, const void *x, const void *gy,
                                       void *gx, bool stream);
 
-    /* Rotate pairs (x[2i], x[2i+1]) by the angles whose cos, sin are the pairs of table; backward: by their negatives.
-     * n elements, n even; the table's `period` elements (even) repeat. */
-    void (*rope)(size_t n, size_t period, const void *x, const void *table, void *y, bool backward);
+    /* By stored type of x and y, i8 NULL: rotate pairs (x[2i], x[2i+1]) by the angles whose cos, sin are the pairs of
+     * table; backward: by their negatives.  n elements, n even; the table's `period` elements (even) repeat. */
+    void (*rope[DAR_DTYPES])(size_t n, size_t period, const void *x, const void *table, void *y, bool backward,
+                             bool stream);
 
     /* w, m, v in place. */
     void (*adamw)(size_t n, const dar_adamw *a, void *w, void *m, void *v, const void *g);

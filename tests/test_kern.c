@@ -89,8 +89,8 @@ CALL(dot, v[0] = k->dot(n, x[0], x[1]))
 CALL(max, v[0] = k->max(n, x[0]))
 CALL(nonfinite, v[0] = (double)k->nonfinite(n, x[0]))
 CALL(softmax_back, k->softmax_back(n, x[0], x[1], 0.3, x[2]))
-CALL(rope, k->rope(n / 2 * 2, 6, x[0], x[1], x[2], false))
-CALL(rope_long, k->rope(n / 2 * 2, 70, x[0], x[1], x[0], true))
+CALL(rope, k->rope[s->type](n / 2 * 2, 6, x[0], x[1], x[2], false, false))
+CALL(rope_long, k->rope[s->type](n / 2 * 2, 70, x[0], x[1], x[0], true, true))
 CALL(adamw, k->adamw(n, &adamw, x[0], x[1], x[4], x[2]))
 
 /* 8-bit rows lie in row 1, as many bytes as elements; f32 ones with flipped signs and those of 16 bits one after the
@@ -196,6 +196,15 @@ static void normed_columns_of(const dar_kern *k, size_t n, struct rows *s, dar_d
     if (t != s->type) k->get[t](n, half, s->row[0]);
 }
 
+/* In place, streamed where n is even. */
+static void rotated(const dar_kern *k, size_t n, struct rows *s, dar_dtype t)
+{
+    _Alignas(64) uint16_t half[LONGEST];
+    k->put[t](n, s->row[0], half, false);
+    k->rope[t](n / 2 * 2, 64, half, s->row[1], half, n % 4 == 0, n % 2 == 0);
+    k->get[t](n, half, s->row[0]);
+}
+
 CALL(norm, norm_of(k, n, s, s->type))
 CALL(norm_bf16, norm_of(k, n, s, DAR_BF16))
 CALL(norm_f16, norm_of(k, n, s, DAR_F16))
@@ -210,6 +219,8 @@ CALL(columns_f16, columns_of(k, n, s, DAR_F16))
 CALL(normed_columns, normed_columns_of(k, n, s, s->type))
 CALL(normed_columns_bf16, normed_columns_of(k, n, s, DAR_BF16))
 CALL(normed_columns_f16, normed_columns_of(k, n, s, DAR_F16))
+CALL(rope_bf16, rotated(k, n, s, DAR_BF16))
+CALL(rope_f16, rotated(k, n, s, DAR_F16))
 
 static const struct {
     const char *name;
@@ -264,6 +275,8 @@ static const struct {
     { "normed_to_f16", call_normed_to_f16 },
     { "normed_columns_bf16", call_normed_columns_bf16 },
     { "normed_columns_f16", call_normed_columns_f16 },
+    { "rope_bf16", call_rope_bf16 },
+    { "rope_f16", call_rope_f16 },
 };
 
 static struct rows found, expected, truth;
@@ -371,7 +384,7 @@ static void functions(void **state)
 static void ulps(void **state)
 {
     (void)state;
-    static ulp_worst worst[3][ULP_FUNCTIONS];
+    static ulp_worst worst[ULP_LEVELS][ULP_FUNCTIONS];
     ulp_scan(&tables, 0, 4099, 0x100000000 / 4099 + 1, worst);
     static const uint32_t special[] = { 0,          0x80000000, 1,          0x80000001, 0x007fffff,
                                         0x807fffff, 0x00800000, 0x7f7fffff, 0xff7fffff, 0x7f800000,
@@ -464,6 +477,32 @@ static void reductions_see_everything(void **state)
             }
 }
 
+/* Second moments of bf16 rows that sums of f32 could not hold: huge, tiny, far from zero, with one element that is not
+ * like the others, constant, not finite. */
+static void moments_of_any_row(void **state)
+{
+    (void)state;
+    static const double scales[] = { 1, 1e30, 1e-30, 0 }, offsets[] = { 0, 3, 200 }, odd[] = { 0, 1e3, 1e6 };
+    static uint16_t x[3000];
+    for (int k = 0; k < tables.n; k++)
+        for (size_t c = 0; c < DAR_COUNT(scales) * DAR_COUNT(offsets) * DAR_COUNT(odd); c++) {
+            size_t o = c / DAR_COUNT(scales), n = DAR_COUNT(x) - c;
+            double scale = scales[c % DAR_COUNT(scales)], mean = 0, second = 0, m[2];
+            for (uint32_t i = 0; i < n; i++) {
+                double v = (int32_t)noise(i) * 0x1p-31 + offsets[o / 3] + (i == 1111 ? odd[o % 3] : 0);
+                x[i] = dar_bf16_from_f32((float)(scale == 0 ? 1e6 : v * scale));
+                mean += dar_bf16_to_f32(x[i]) / (double)n;
+            }
+            for (size_t i = 0; i < n; i++) second += pow(dar_bf16_to_f32(x[i]) - mean, 2);
+            tables.f32[k].moments[DAR_BF16](n, x, true, m);
+            CHECK_NEAR("mean", m[0], mean, (fabs(mean) + sqrt(second / (double)n)) * 0x1p-20);
+            CHECK_NEAR("second moment", m[1], second, second * 0x1p-16 + mean * mean * 0x1p-60);
+            x[n - 1] = 0x7f80;
+            tables.f32[k].moments[DAR_BF16](n, x, true, m);
+            CHECK(!isfinite(m[1]), "%s: the second moment of an infinity is %g", tables.f32[k].name, m[1]);
+        }
+}
+
 static void quantised_rows(void **state)
 {
     (void)state;
@@ -531,7 +570,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(exact_kernels),  cmocka_unit_test(functions),   cmocka_unit_test(ulps),
         cmocka_unit_test(conversions),    cmocka_unit_test(streams),     cmocka_unit_test(reductions_see_everything),
-        cmocka_unit_test(quantised_rows), cmocka_unit_test(adamw_steps),
+        cmocka_unit_test(quantised_rows), cmocka_unit_test(adamw_steps), cmocka_unit_test(moments_of_any_row),
     };
     return cmocka_run_group_tests(tests, setup, NULL) != 0;
 }

@@ -12,7 +12,7 @@
 
 static ulp_tables tables;
 static uint32_t step = 1;
-static ulp_worst worst[CHUNKS][3][ULP_FUNCTIONS];
+static ulp_worst worst[CHUNKS][ULP_LEVELS][ULP_FUNCTIONS];
 
 static void scan(void *ctx, size_t i, int thread)
 {

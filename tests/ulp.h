@@ -14,20 +14,23 @@
 #include "lib/status.h"
 
 /* The f32 tables of the levels that this processor has; [0], the reference, calls the C library and is not scanned. */
+#define ULP_LEVELS 4
+
 typedef struct ulp_tables {
-    dar_kern f32[3], f64;
+    dar_kern f32[ULP_LEVELS], f64;
     int n;
 } ulp_tables;
 
 static inline void ulp_tables_init(ulp_tables *t)
 {
     unsigned flags = dar_cpu_detect();
-    t->n = flags & DAR_CPU_AVX512 ? 3 : flags & DAR_CPU_AVX2 ? 2 : 1;
+    t->n = flags & DAR_CPU_BF16 ? 4 : flags & DAR_CPU_AVX512 ? 3 : flags & DAR_CPU_AVX2 ? 2 : 1;
     dar_kern_ref_f64(&t->f64);
     for (int i = 0; i < t->n; i++) {
         dar_kern_ref_f32(&t->f32[i]);
         if (i == 1) dar_kern_avx2(&t->f32[i]);
         if (i == 2) dar_kern_avx512(&t->f32[i]);
+        if (i == 3) dar_kern_bf16(&t->f32[i]);
     }
 }
 
@@ -72,7 +75,7 @@ typedef struct ulp_worst {
 
 /* Look at the arguments with bits first, first + step, ... (n of them) and raise worst[level][function]. */
 static inline void ulp_scan(const ulp_tables *t, uint32_t first, uint32_t step, size_t n,
-                            ulp_worst worst[3][ULP_FUNCTIONS])
+                            ulp_worst worst[ULP_LEVELS][ULP_FUNCTIONS])
 {
     float x[ULP_BLOCK], y[ULP_BLOCK];
     double x64[ULP_BLOCK], truth[ULP_BLOCK];

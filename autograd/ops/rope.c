@@ -72,23 +72,22 @@ struct walk {
     bool backward;
 };
 
-/* In pieces of whole heads. */
+/* In pieces of whole heads.  Both sides are stored alike; what is added to is a gradient, of the arithmetic type. */
 static void rotate_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct walk *w = ctx;
     const dar_kern *k = dar_kern_for(w->type);
     size_t step = DAR_PIECE / w->e * w->e;
-    double xbuf[DAR_PIECE], tbuf[DAR_PIECE], ybuf[DAR_PIECE];
+    double tbuf[DAR_PIECE], sum[DAR_PIECE];
     (void)thread;
     for (size_t row = begin; row < end; row++) {
         const void *angles = dar_tensor_at(w->table, row % w->tokens * w->e);
         const void *table = dar_row_get(w->type, w->table->dtype, angles, w->e, tbuf);
         for (size_t j = 0; j < w->d; j += step) {
             size_t n = w->d - j < step ? w->d - j : step, i = row * w->d + j;
-            const void *x = dar_row_get(w->type, w->from->dtype, dar_tensor_at(w->from, i), n, xbuf);
-            void *y = dar_row_out(w->type, w->to->dtype, dar_tensor_at(w->to, i), w->mode, ybuf);
-            k->rope(n, w->e, x, table, y, w->backward);
-            dar_row_put(w->type, y, w->to->dtype, dar_tensor_at(w->to, i), n, w->mode);
+            void *to = dar_tensor_at(w->to, i), *y = w->mode == DAR_PUT_ADD ? sum : to;
+            k->rope[w->to->dtype](n, w->e, dar_tensor_at(w->from, i), table, y, w->backward, w->mode == DAR_PUT_STREAM);
+            if (y != to) dar_row_put(w->type, y, w->to->dtype, to, n, w->mode);
         }
     }
 }
