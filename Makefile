@@ -102,7 +102,7 @@ $B/test_%: $B/tests/test_%.o $B/libdar.a
 $B/test_corpus: $(FUZZ:%=$B/tests/%.o)
 
 $B/test_config $B/test_dit $B/test_adapter $B/test_lora $B/test_scene $B/test_step $B/test_load \
-$B/test_sampler $B/test_checkpoint: $B/tests/model.o
+$B/test_sampler $B/test_checkpoint $B/test_train_step: $B/tests/model.o
 
 test: deps ## install what is missing, build, run every test; the last line counts them
 	@$(MAKE) --no-print-directory test-built

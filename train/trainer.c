@@ -48,6 +48,11 @@ static dar_status open_loader(dar_trainer *t, bool plan, dar_err *e)
     return dar_loader_open(&t->loader, &l, e);
 }
 
+static dar_status open_validator(dar_trainer *t, dar_err *e)
+{
+    return dar_validator_open(&t->validator, t->c, t->m, t->cache, dar_loader_latent(t->loader), e);
+}
+
 static dar_status init_optim(dar_trainer *t, dar_err *e)
 {
     const dar_train_config *c = t->c;
@@ -72,7 +77,7 @@ static size_t memory_of_machine(void)
 size_t dar_trainer_bytes(const dar_trainer_plan *p)
 {
     const dar_step_plan *s = &p->step[p->how];
-    return p->weights + p->moments + p->batches + s->bytes[0] + s->bytes[1];
+    return p->weights + p->moments + p->batches + p->validation + s->bytes[0] + s->bytes[1];
 }
 
 static void count_parameters(dar_trainer *t)
@@ -95,7 +100,8 @@ static dar_status plan_step(dar_trainer *t, dar_err *e)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found 1 frame, which is the reference itself: expected 5, 9, 13, ...",
                         t->clips.path[0]);
     DAR_TRY(dar_step_count(p->step, c, &t->m->dit, &size, e));
-    size_t budget = c->budget > 0 ? (size_t)(c->budget * 1e9) : p->machine, rest = p->weights + p->moments + p->batches;
+    size_t rest = p->weights + p->moments + p->batches + p->validation;
+    size_t budget = c->budget > 0 ? (size_t)(c->budget * 1e9) : p->machine;
     p->how = dar_step_choose(c, p->step, budget > rest ? budget - rest : 0);
     p->tokens = (double)(z.d[0] * z.d[2] * (z.d[3] / d->patch) * (z.d[4] / d->patch) * c->accumulate);
     p->flops = (p->step[p->how].forward + p->step[p->how].backward) * (double)c->accumulate;
@@ -117,15 +123,19 @@ static dar_status plan(dar_trainer *t, dar_err *e)
     t->plan.moments = t->moments.peak;
     DAR_TRY(open_loader(t, true, e));
     t->plan.batches = dar_loader_bytes(t->loader);
+    DAR_TRY(open_validator(t, e));
+    t->plan.validation = dar_validator_bytes(t->validator);
     return plan_step(t, e);
 }
 
 static void drop_plan(dar_trainer *t)
 {
+    dar_validator_close(t->validator);
     dar_loader_close(t->loader);
     dar_cache_close(t->cache);
     dar_arena_free(&t->moments);
     dar_model_close(t->m);
+    t->validator = NULL;
     t->loader = NULL;
     t->cache = NULL;
     t->m = NULL;
@@ -169,10 +179,10 @@ static dar_status stop_asked(void *ctx, dar_err *e)
                     t->c->output);
 }
 
-static dar_status fill_cache(dar_trainer *t, dar_err *e)
+static dar_status fill_cache(dar_trainer *t, const dar_clips *clips, dar_err *e)
 {
     dar_cache_report r = { 0 };
-    DAR_TRY(dar_cache_fill(t->cache, (const char *const *)(uintptr_t)t->clips.path, t->clips.n, stop_asked, t, &r, e));
+    DAR_TRY(dar_cache_fill(t->cache, (const char *const *)(uintptr_t)clips->path, clips->n, stop_asked, t, &r, e));
     if (r.damaged) dar_log(DAR_LOG_WARNING, "cache: %zu entries were damaged and made again", r.damaged);
     return DAR_OK;
 }
@@ -191,7 +201,9 @@ static dar_status open_run(dar_trainer *t, const dar_trainer_options *o, dar_err
     DAR_TRY(dar_checkpoint_open(&t->saver, e));
     DAR_TRY(dar_checkpoint_resume(&t->saver, o->resume, e));
     DAR_TRY(open_loader(t, false, e));
-    DAR_TRY(fill_cache(t, e));
+    DAR_TRY(open_validator(t, e));
+    DAR_TRY(fill_cache(t, &t->clips, e));
+    if (t->validator) DAR_TRY(fill_cache(t, dar_validator_clips(t->validator), e));
     DAR_TRY(dar_step_init(&t->step, c, &t->m->dit, t->plan.how, &t->plan.step[t->plan.how], e));
     dar_journal_options j = { c->output, c->steps, t->plan.tokens, t->plan.flops, t->plan.peak };
     return dar_journal_open(&t->journal, &j, t->saver.step, e);
@@ -252,16 +264,24 @@ static dar_status save(dar_trainer *t, int64_t done, dar_err *e)
     return dar_checkpoint_save(&t->saver, done, e);
 }
 
+static bool every(int64_t k, int64_t steps)
+{
+    return steps && k % steps == 0;
+}
+
 dar_status dar_trainer_run(dar_trainer *t, dar_err *e)
 {
     const dar_train_config *c = t->c;
-    for (int64_t k = t->saver.step; k < c->steps; k++) {
-        DAR_TRY(run_step(t, k, e));
+    for (int64_t k = t->saver.step; k < c->steps;) {
+        DAR_TRY(run_step(t, k++, e));
+        bool last = k == c->steps;
+        if (t->validator && !dar_interrupted() && (last || every(k, c->validate_every)))
+            DAR_TRY(dar_validator_run(t->validator, &t->step, t->journal, k, e));
         bool stop = dar_interrupted();
-        if (stop || k + 1 == c->steps || (c->save_every && (k + 1) % c->save_every == 0)) DAR_TRY(save(t, k + 1, e));
-        if (stop)
+        if (stop || last || every(k, c->save_every)) DAR_TRY(save(t, k, e));
+        if (stop && !last)
             return dar_fail(e, DAR_ERR_INTERRUPTED, "%s: stopped and saved after step %lld; --resume auto goes on",
-                            c->output, (long long)(k + 1));
+                            c->output, (long long)k);
     }
     return DAR_OK;
 }

@@ -13,6 +13,7 @@
 #include "train/clips.h"
 #include "train/journal.h"
 #include "train/step.h"
+#include "train/validate.h"
 
 typedef struct dar_trainer_options {
     const char *resume; /* train/checkpoint.h */
@@ -21,8 +22,9 @@ typedef struct dar_trainer_options {
 
 /* What a run takes. */
 typedef struct dar_trainer_plan {
-    size_t trained, frozen;                    /* numbers */
-    size_t weights, moments, batches, machine; /* [bytes]; weights: with gradients; machine: of memory, in all */
+    size_t trained, frozen;                       /* numbers */
+    size_t weights, moments, batches, validation; /* [bytes]; weights: with gradients */
+    size_t machine;                               /* [bytes] of memory that it has */
     dar_step_plan step[DAR_RECOMPUTE_ALL + 1];
     dar_recompute how;
     double tokens, flops, peak; /* of a step; [FLOP] of a step; [FLOP/s] that products reach here */
@@ -40,7 +42,8 @@ typedef struct dar_trainer {
     dar_step step;
     dar_checkpoint saver;
     dar_journal *journal;
-    dar_json_writer text[2]; /* configuration, model */
+    dar_validator *validator; /* NULL: nothing is validated */
+    dar_json_writer text[2];  /* configuration, model */
 } dar_trainer;
 
 /* c must outlive the trainer.  On failure *out is NULL. */
