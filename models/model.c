@@ -157,12 +157,13 @@ static void find_part(dar_model *m, const dar_model_file *f, const dar_model_opt
 
 static bool needs(const dar_model_options *o, int part)
 {
-    return !o->plan && (part == DAR_MODEL_VAE || (part == DAR_MODEL_DIT && !o->fresh));
+    return !o->plan && (part == DAR_MODEL_VAE || part == DAR_MODEL_DIT);
 }
 
 static dar_status open_parts(dar_model *m, const dar_model_file *f, const dar_model_options *o, dar_err *e)
 {
     for (int i = 0; i < DAR_MODEL_PARTS; i++) {
+        if (o->fresh && i != DAR_MODEL_VAE) continue;
         find_part(m, f, o, (dar_model_part)i);
         if (*m->path[i]) DAR_TRY(dar_weights_open(&m->open[i], m->path[i], e));
         else if (needs(o, i))

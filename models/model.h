@@ -73,8 +73,8 @@ typedef struct dar_model_options {
     bool apart;                        /* they are not merged into the weights */
     bool plan;                         /* the networks lie on a planning arena; weights need not be there */
 
-    /* Training: roles that get gradients; additions of config.lora are made if they are among them.  `fresh`: values of
-     * the transformer without a file are drawn from `seed`, as are those of new additions. */
+    /* Training: roles that get gradients; additions of config.lora are made if they are among them.  `fresh`: the
+     * transformer's values are drawn from `seed`, not read, as are those of new additions always. */
     unsigned train;
     bool fresh;
     uint64_t seed;

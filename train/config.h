@@ -9,7 +9,7 @@
  *   parts.dit .vae .adapter .lora  text           null     files of them instead
  *   train                        lora | full | vae  lora   low-rank additions and adapter; transformer and adapter; the
  *                                                          autoencoder
- *   from_scratch                 bool             false    weights that no file has are drawn by the seed
+ *   from_scratch                 bool             false    the transformer is drawn by the seed, not read
  *   data                         list of texts    needed   bundles, or directories of them
  *   condition                    object           {}       keys of data/condition.h, over those of the model
  *   adapter                      object           {}       keys of models/config.h, likewise: blocks, widen

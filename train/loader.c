@@ -452,6 +452,11 @@ void dar_loader_close(dar_loader *l)
     free(l);
 }
 
+int64_t dar_loader_words(const dar_loader *l)
+{
+    return l->c.cache && l->text ? l->c.dit->text_keys : 0;
+}
+
 size_t dar_loader_bytes(const dar_loader *l)
 {
     return l->arena.peak + l->scratch.size;

@@ -135,7 +135,7 @@ static dar_status render(dar_validator *v, const dar_batch *b, struct showing *s
     v->tape.recording = false;
     dar_tensor known = as_main(v, &b->known), z0 = as_main(v, &b->z0);
     dar_tensor z = dar_tensor_push(&v->kept, v->m->dit.main, *d);
-    dar_sampler_clip clip = { d->d[2], d->d[3], d->d[4], b->cond, { words_of(b) } };
+    dar_sampler_clip clip = { d->d[2], d->d[3], d->d[4], b->cond, .text = { words_of(b) } };
     DAR_TRY(dar_sampler_init(&sampler, &v->m->dit, &how, &clip, &v->kept, &v->step, e));
     dar_sampler_noise(DAR_NOISE_OWN, (uint64_t)c->seed, &z, &v->step);
     dar_status s = dar_sampler_run(&sampler, known.data ? &known : NULL, c->first == DAR_FIRST_NOISY ? NULL : &z0, &z,
