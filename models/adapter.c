@@ -78,6 +78,18 @@ struct patches {
     int64_t first, r, h, w;
 };
 
+/* A line of 2 r pixels into every fourth number: pixel k r + dx to place 4 dx + k. */
+#define SPREAD(type)                                                                                                   \
+    static void spread_##type(type *to, const type *line, int64_t r)                                                   \
+    {                                                                                                                  \
+        for (int64_t dx = 0; dx < r; dx++) {                                                                           \
+            to[4 * dx] = line[dx];                                                                                     \
+            to[4 * dx + 1] = line[r + dx];                                                                             \
+        }                                                                                                              \
+    }
+SPREAD(float)
+SPREAD(double)
+
 /* Token `row` of `out`: 2 r x 2 r pixels of every channel, a line of pixels at a time. */
 static void patch(const struct patches *p, int64_t row)
 {
@@ -85,19 +97,17 @@ static void patch(const struct patches *p, int64_t row)
     int64_t C = s->d[1], F = s->d[2], H = s->d[3], W = s->d[4], r = p->r;
     int64_t picture = p->first + row / (p->h * p->w), i = row / p->w % p->h, j = row % p->w;
     dar_dtype type = p->out->dtype;
-    size_t size = dar_dtype_size(type), k = dar_tensor_cols(p->out);
-    char *to = dar_tensor_at(p->out, (size_t)row * k);
+    size_t k = dar_tensor_cols(p->out);
     double buf[DAR_PIECE];
 
     for (int64_t c = 0; c < C; c++)
         for (int64_t y = 0; y < 2 * r; y++) {
             int64_t at = (((picture / F * C + c) * F + picture % F) * H + 2 * r * i + y) * W + 2 * r * j;
-            const char *line =
+            const void *line =
                 dar_row_get(type, p->cond->dtype, dar_tensor_at(p->cond, (size_t)at), (size_t)(2 * r), buf);
-            for (int64_t x = 0; x < 2 * r; x++) {
-                int64_t column = ((c * r + y % r) * r + x % r) * 4 + y / r * 2 + x / r;
-                memcpy(to + (size_t)column * size, line + (size_t)x * size, size);
-            }
+            void *to = dar_tensor_at(p->out, (size_t)row * k + (size_t)((c * r + y % r) * r * 4 + y / r * 2));
+            if (type == DAR_F64) spread_double(to, line, r);
+            else spread_float(to, line, r);
         }
 }
 
