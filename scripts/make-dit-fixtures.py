@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""make-dit-fixtures.py: write tests/fixtures/dit_*.safetensors, what tests/test_dit.c compares with.
+"""make-dit-fixtures.py: write tests/fixtures/dit_*.safetensors, what tests/test_dit.c and others compare with.
 
 The transformer is that of diffusers, LoRA that of peft, the adapter a few lines from its published formula; all of it
 in float64.  Sizes come from models/presets/dar-test.json.
@@ -10,12 +10,15 @@ in float64.  Sizes come from models/presets/dar-test.json.
     dit_lora.safetensors      LoRA in the PEFT form, which does not say alpha: bf16
     dit_stages.safetensors    stages, velocity, loss, gradients: float64
     dit_steps.safetensors     the first clip after each of five steps of Euler with guidance: float64
+    dit_train.safetensors     ten steps of AdamW on LoRA and adapter: losses, norms, what they end with: float64
 
 Run from the root of the tree.  The tests need none of this: the files are committed.
 """
 import json
+import math
 import re
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from diffusers import WanTransformer3DModel
@@ -113,7 +116,7 @@ def steps(net, control, z, known, words):
     bend = lambda s: 5 * s / (1 + 4 * s)
     sigma = [bend(1 + (bend(0.001) - 1) * i / 4) for i in range(5)] + [0.0]
     first = known[:, known.shape[1] - z.shape[1] :, :1]
-    net.patch_embedding.register_forward_hook(lambda m, args, y: y + control)
+    add = net.patch_embedding.register_forward_hook(lambda m, args, y: y + control)
     z = torch.cat([first, z[:, :, 1:]], dim=2)
     out = {}
     for i in range(5):
@@ -123,6 +126,69 @@ def steps(net, control, z, known, words):
         z = z + (sigma[i + 1] - sigma[i]) * (u + 3 * (c - u))
         z = torch.cat([first, z[:, :, 1:]], dim=2)
         out[f"step.{i + 1}"] = z
+    add.remove()
+    return out
+
+
+def philox(seed, stream, n):
+    """Random 64 bits, n of them: lib/rng.h."""
+    i = np.arange((n + 1) // 2, dtype=np.uint64)
+    low = np.uint64(0xFFFFFFFF)
+    c = [i & low, i >> np.uint64(32), np.full_like(i, stream & 0xFFFFFFFF), np.full_like(i, stream >> 32)]
+    k = [seed & 0xFFFFFFFF, seed >> 32]
+    for _ in range(10):
+        p, q = c[0] * np.uint64(0xD2511F53), c[2] * np.uint64(0xCD9E8D57)
+        c = [q >> np.uint64(32) ^ c[1] ^ np.uint64(k[0]), q & low, p >> np.uint64(32) ^ c[3] ^ np.uint64(k[1]), p & low]
+        k = [(k[0] + 0x9E3779B9) & 0xFFFFFFFF, (k[1] + 0xBB67AE85) & 0xFFFFFFFF]
+    return np.stack([c[1] << np.uint64(32) | c[0], c[3] << np.uint64(32) | c[2]], axis=1).reshape(-1)[:n]
+
+
+def stream(name):
+    h = 0xCBF29CE484222325
+    for c in name.encode():
+        h = (h ^ c) * 0x100000001B3 % 2**64
+    return h
+
+
+def normal(seed, at, shape):
+    x = (philox(seed, at, math.prod(shape)) >> np.uint64(11)).reshape(-1, 2).astype(np.float64)
+    r, a = np.sqrt(-2 * np.log((x[:, 0] + 1) * 2.0**-53)), 2 * math.pi * x[:, 1] * 2.0**-53
+    return torch.from_numpy(np.stack([r * np.cos(a), r * np.sin(a)], axis=1).reshape(shape))
+
+
+def learn(net, adapter, z0, known, cond, words, seed=5):
+    """Ten steps, of which the first three warm up; noise and times as dar-train draws them.  The first frame is clean,
+    at time 0, and not counted."""
+    named = list(net.named_parameters()) + [("control_adapter." + n, q) for n, q in adapter.named_parameters()]
+    named = {public(name.replace(".default", "")): q for name, q in named if q.requires_grad}
+    optimizer = torch.optim.AdamW(named.values(), lr=1e-3, betas=(0.9, 0.999), eps=1e-8, weight_decay=0.03)
+    warmup = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda k: min(1, k / 3))
+    control = {}
+    net.patch_embedding.register_forward_hook(lambda m, args, y: y + control["is"])
+    u = (philox(seed, stream("train.sigma"), 10 * CLIPS) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    noise = philox(seed, stream("train.noise"), 10 * CLIPS)
+    losses, norms = [], []
+    for k in range(10):
+        s = torch.tensor([1 - math.floor(1000 * u[k * CLIPS + b]) / 1000 for b in range(CLIPS)], dtype=torch.float64)
+        sigma = 5 * s / (1 + 4 * s)
+        eps = torch.cat([normal(seed, int(noise[k * CLIPS + b]), (1, *z0.shape[1:])) for b in range(CLIPS)])
+        mix = sigma.view(-1, 1, 1, 1, 1)
+        z = torch.cat([z0[:, :, :1], ((1 - mix) * z0 + mix * eps)[:, :, 1:]], dim=2)
+        times = (1000 * sigma)[:, None].repeat(1, FRAMES * ROWS * COLUMNS)
+        times[:, : ROWS * COLUMNS] = 0
+        control["is"] = adapter(cond)
+        v = net(torch.cat([z, known], dim=1), times, words, return_dict=False)[0]
+        loss = F.mse_loss(v[:, :, 1:], (eps - z0)[:, :, 1:])
+        optimizer.zero_grad()
+        loss.backward()
+        losses.append(loss.item())
+        norms.append(torch.nn.utils.clip_grad_norm_(named.values(), 1.0).item())
+        optimizer.step()
+        warmup.step()
+    print("losses", losses, "norms", norms)
+    out = {"after." + name: q.detach() for name, q in named.items()}
+    for name, x in (("loss", losses), ("norm", norms)):
+        out[name] = torch.tensor(x, dtype=torch.float64)
     return out
 
 
@@ -220,6 +286,12 @@ def main():
             f"tests/fixtures/dit_{name}.safetensors",
             metadata={"made by": "scripts/make-dit-fixtures.py"},
         )
+
+    save_file(
+        {k: x.contiguous() for k, x in learn(net, adapter, z, known, cond, padded).items()},
+        "tests/fixtures/dit_train.safetensors",
+        metadata={"made by": "scripts/make-dit-fixtures.py"},
+    )
 
 
 main()

@@ -301,6 +301,109 @@ static void overfits(void **state)
     stop(&l);
 }
 
+/* ---------------------------------------------------------------- PyTorch */
+
+static dar_weights *fixture(const char *name)
+{
+    dar_weights *w;
+    dar_err e;
+    CHECK(dar_weights_open(&w, name, &e) == DAR_OK, "%s", e.text);
+    return w;
+}
+
+static double number(dar_weights *w, const char *name, size_t i)
+{
+    dar_tensor x;
+    dar_err e;
+    CHECK(dar_weights_tensor(w, name, &x, &e) == DAR_OK, "%s", e.text);
+    return dar_dtype_get(x.dtype, x.data, i);
+}
+
+/* Largest distance of a trained parameter from the fixture's, over the largest of these; the worst of all. */
+static double distance_after(dar_weights *w, const dar_params *p)
+{
+    double worst = 0;
+    for (size_t i = 0; i < p->count; i++) {
+        const dar_param *q = p->at[i];
+        char name[2 * DAR_PARAM_NAME];
+        dar_lora_key key;
+        if (!q->trainable) continue;
+        if (q->info.role != DAR_PARAM_LORA) snprintf(name, sizeof name, "after.%s", q->name);
+        else if (dar_lora_parse(&key, q->name, 2))
+            snprintf(name, sizeof name, "after.blocks.%d.%s.lora_%c.weight", (int)key.block,
+                     dar_projection_names[key.projection], key.part == DAR_LORA_DOWN ? 'A' : 'B');
+        double most = 0, largest = 0;
+        for (size_t k = 0; k < dar_tensor_count(&q->x); k++) {
+            double x = dar_dtype_get(q->x.dtype, q->x.data, k), y = number(w, name, k);
+            if (!(fabs(x - y) <= most)) most = fabs(x - y);
+            largest = fmax(largest, fabs(y));
+        }
+        if (!(most / largest <= worst)) worst = most / largest;
+    }
+    return worst;
+}
+
+/* Ten steps of AdamW with warm-up and clipping, noise and times drawn alike, against the same in float64. */
+static void against_torch(dar_dtype storage, double bound_loss, double bound_after)
+{
+    dar_train_config c = standard();
+    dar_lora_read_options read = { .alpha = 1.5, .strength = 1 };
+    dar_config preset = model_preset("dar-test");
+    dar_weights *lora = fixture("tests/fixtures/dit_lora.safetensors"),
+                *weights = fixture("tests/fixtures/dit_weights.safetensors"),
+                *expected = fixture("tests/fixtures/dit_train.safetensors");
+    dar_step_plan plan[DAR_RECOMPUTE_ALL + 1];
+    dar_arena moments;
+    dar_optim optim;
+    dar_step step;
+    dar_err e;
+    model o;
+    c.seed = 5;
+    c.storage = storage;
+    c.text_dropout = 0;
+    model_init(&o, &preset, storage, false);
+    dar_lora_init(&o.m, &o.p, &preset.lora);
+    dar_params_train(&o.p, LORA);
+    model_fixture(&o, weights);
+    CHECK(dar_lora_read(&o.m, &o.p, lora, &read, &e) == DAR_OK, "%s", e.text);
+    dar_params_gradients(&o.p);
+
+    dar_step_size size = {
+        2, 3, 4, 6, .words = 7, .cond = o.clip.cond.shape.d[1], .pixels = o.clip.cond.shape.d[3] / 4
+    };
+    CHECK(dar_step_count(plan, &c, &o.m, &size, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_step_init(&step, &c, &o.m, DAR_RECOMPUTE_MOST, &plan[DAR_RECOMPUTE_MOST], &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_arena_init(&moments, "moments", (size_t)16 << 20, &e), DAR_OK);
+    dar_optim_config how = { .rate = 1e-3, .beta1 = 0.9, .beta2 = 0.999, .eps = 1e-8, .decay = 0.03, .max_norm = 1 };
+    how.warmup = 3;
+    dar_optim_init(&optim, &how, &o.p, &moments);
+    dar_batch b = { .z0 = o.z, .known = o.clip.known, .cond = o.clip.cond, .text = o.text, .count = o.count };
+    double worst = 0;
+    for (int k = 0; k < 10; k++) {
+        double loss = dar_step_run(&step, &b, k, 0).loss, norm = dar_optim_step(&optim).norm;
+        worst = fmax(worst, fabs(loss / number(expected, "loss", (size_t)k) - 1));
+        CHECK_NEAR("loss", loss, number(expected, "loss", (size_t)k), bound_loss);
+        CHECK_NEAR("norm", norm, number(expected, "norm", (size_t)k), 10 * bound_loss);
+    }
+    double after = distance_after(expected, &o.p);
+    printf("note: ten steps against PyTorch, %s: losses %.1e, parameters %.1e\n", dar_dtype_name(storage), worst,
+           after);
+    CHECK_NEAR("parameters after ten steps", after, 0, bound_after);
+    dar_step_free(&step);
+    dar_arena_free(&moments);
+    model_free(&o);
+    dar_weights_close(lora);
+    dar_weights_close(weights);
+    dar_weights_close(expected);
+}
+
+static void ten_steps_of_torch(void **state)
+{
+    (void)state;
+    against_torch(DAR_F64, 1e-13, 1e-12);
+    against_torch(DAR_F32, 1e-5, 1e-5);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -311,6 +414,7 @@ int main(void)
         cmocka_unit_test(what_is_drawn),
         cmocka_unit_test(text_is_dropped),
         cmocka_unit_test(overfits),
+        cmocka_unit_test(ten_steps_of_torch),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
