@@ -1,0 +1,247 @@
+/* test_dar_train.c: the program dar-train as people meet it: from nothing to a backbone, from that every channel set,
+ * to videos; interrupted, resumed, any number of threads; what is wrong in one line. */
+#include "tests/run.h"
+
+#include "lib/json.h"
+#include "lib/safetensors_write.h"
+#include "models/config.h"
+#include "models/vae.h"
+#include "data/condition.h"
+
+#define CLIPS 3
+
+static char dir[] = "/tmp/dar-train-XXXXXX", program[PATH_MAX], bundler[PATH_MAX], sampler[PATH_MAX];
+
+#define RUN(...)  RUN_PROGRAM(program, __VA_ARGS__)
+#define SET(text) "--set", text
+
+/* ---------------------------------------------------------------- a model, bundles, configurations */
+
+/* A token is 8 x 8 pixels. */
+static const char model[] = "{\"name\": \"small\","
+                            "\"dit\": {\"width\": 20, \"heads\": 2, \"layers\": 2, \"ffn\": 27, \"latent\": 5,"
+                            "\"frequencies\": 16, \"text_width\": 13, \"text_keys\": 11},"
+                            "\"adapter\": {\"unshuffle\": 4},"
+                            "\"vae\": {\"patch\": 1, \"multipliers\": [1, 2, 2], \"halve_time\": [true, true],"
+                            "\"encoder_width\": 3, \"decoder_width\": 4, \"encoder_blocks\": 1,"
+                            "\"decoder_blocks\": 1}}";
+
+static const char backbone[] =
+    "{\"model\": \"small\", \"train\": \"full\", \"from_scratch\": true, \"data\": [\"clips\"],"
+    "\"output_dir\": \"backbone\", \"cache_dir\": \"cache\", \"mixed_precision\": \"f32\","
+    "\"learning_rate\": 0.003, \"lr_warmup_steps\": 2, \"max_train_steps\": 20,"
+    "\"train_batch_size\": 2, \"max_grad_norm\": 1, \"adam_epsilon\": 1e-8,"
+    "\"validation\": {\"data\": [\"clips\"], \"steps\": 20, \"clips\": 1, \"sampler_steps\": 2}}";
+
+static const char additions[] =
+    "{\"base\": \"backbone.json\", \"model\": \"backbone/checkpoint-20\", \"train\": \"lora\","
+    "\"from_scratch\": false, \"rank\": 4, \"output_dir\": \"lora\", \"train_batch_size\": 1,"
+    "\"condition\": {\"channels\": \"dar\"}, \"validation\": {\"steps\": 0}}";
+
+static void write_vae(void)
+{
+    dar_arena a;
+    dar_params p;
+    dar_vae vae = { 0 };
+    dar_config c;
+    dar_err e;
+    assert_int_equal(mkdir("small", 0777), 0);
+    run_write("small/model.json", model, sizeof model - 1);
+    CHECK(dar_config_open(&c, "small/model.json", &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(dar_arena_init(&a, "weights", 16 << 20, &e), DAR_OK);
+    dar_params_init(&p, &a, DAR_F32);
+    dar_vae_init(&vae, &p, &c.vae);
+    dar_params_fresh(&p, DAR_PARAM_ALL, 1);
+    dar_safetensors_item *item = calloc(p.count, sizeof *item);
+    assert_non_null(item);
+    for (size_t i = 0; i < p.count; i++) item[i] = (dar_safetensors_item){ p.at[i]->name, p.at[i]->x };
+    CHECK(dar_safetensors_write("small/vae.safetensors", item, p.count, NULL, &e) == DAR_OK, "%s", e.text);
+    free(item);
+    dar_params_free(&p);
+    dar_arena_free(&a);
+}
+
+static void write_bundles(void)
+{
+    static const char cube[] = "v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1\n"
+                               "f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 3 4 8\nf 3 8 7\nf 1 5 8\n"
+                               "f 1 8 4\nf 2 3 7\nf 2 7 6\n";
+    static const struct {
+        const char *name, *size, *frames, *path;
+    } made[] = { { "clips/a", "40x24", "9", "orbit-60" },
+                 { "clips/b", "40x24", "9", "orbit-0-45" },
+                 { "clips/c", "40x24", "9", "dolly-15" },
+                 { "large", "48x24", "9", "dolly-15" },
+                 { "one", "40x24", "1", "dolly-15" } };
+    run_write("cube.obj", cube, sizeof cube - 1);
+    assert_int_equal(mkdir("clips", 0777), 0);
+    for (size_t i = 0; i < DAR_COUNT(made); i++) {
+        int status = RUN_PROGRAM(bundler, "render", "cube.obj", "-o", made[i].name, "--size", made[i].size, "--frames",
+                                 made[i].frames, "--families", "all", "--trajectory", made[i].path, "--shade", "day");
+        CHECK(status == 0, "%s: %s", made[i].name, ran.err);
+    }
+}
+
+static int setup(void **state)
+{
+    (void)state;
+    if (!mkdtemp(dir) || chdir(dir)) return -1;
+    write_vae();
+    write_bundles();
+    run_write("backbone.json", backbone, sizeof backbone - 1);
+    run_write("lora.json", additions, sizeof additions - 1);
+    return 0;
+}
+
+static int teardown(void **state)
+{
+    (void)state;
+    return chdir("/") || run_remove(dir);
+}
+
+/* The losses in a run's log, in order. */
+static size_t losses(const char *run, double *x, size_t most)
+{
+    char path[128], line[4096];
+    size_t n = 0;
+    snprintf(path, sizeof path, "%s/log.jsonl", run);
+    FILE *f = fopen(path, "rb");
+    assert_non_null(f);
+    while (fgets(line, sizeof line, f)) {
+        dar_json_doc *doc;
+        dar_err e;
+        CHECK(dar_json_parse(&doc, path, line, strlen(line), &e) == DAR_OK, "%s", e.text);
+        dar_json root = dar_json_root(doc);
+        if (strcmp(dar_json_text(root, "kind", ""), "step") == 0) {
+            CHECK(n < most, "%s: more than %zu steps", path, most);
+            x[n++] = dar_json_number(root, "loss", NAN, -INFINITY, INFINITY);
+        }
+        dar_json_close(doc);
+    }
+    fclose(f);
+    return n;
+}
+
+static void same_state(const char *a, const char *b)
+{
+    static const char *const files[] = { "adapter.safetensors", "lora.safetensors", "optimizer.safetensors" };
+    for (size_t i = 0; i < DAR_COUNT(files); i++) {
+        char x[128], y[128];
+        snprintf(x, sizeof x, "%s/%s", a, files[i]);
+        snprintf(y, sizeof y, "%s/%s", b, files[i]);
+        run_same_file(x, y);
+    }
+}
+
+/* ---------------------------------------------------------------- tests, in order */
+
+/* From nothing; the others start from what it leaves. */
+static void a_backbone(void **state)
+{
+    (void)state;
+    double loss[32];
+    GOOD("backbone.json", "--dry-run");
+    CHECK(strstr(ran.out, "parameters") && !run_is_there("backbone"), "a dry run: %s", ran.out);
+    GOOD("backbone.json");
+    CHECK(!strstr(ran.err, "warning"), "%s", ran.err);
+    assert_int_equal(losses("backbone", loss, 32), 20);
+    CHECK(loss[19] < loss[0], "the loss goes from %g to %g", loss[0], loss[19]);
+    CHECK(run_is_there("backbone/samples/step-00000020/a.png"), "no sample");
+    CHECK(run_is_there("backbone/checkpoint-20/model.json"), "no model");
+}
+
+/* Each set that has a name learns, without a word of warning, and renders. */
+static void every_set(void **state)
+{
+    (void)state;
+    double loss[64];
+    for (size_t i = 0; i < dar_channel_alias_count; i++) {
+        const char *name = dar_channel_aliases[i].name;
+        char channels[64], out[64], model_of[64];
+        snprintf(channels, sizeof channels, "condition.channels=%s", name);
+        snprintf(out, sizeof out, "output_dir=set-%s", name);
+        snprintf(model_of, sizeof model_of, "set-%s/checkpoint-50", name);
+        GOOD("lora.json", SET(channels), SET(out), SET("max_train_steps=50"), "--threads", "1");
+        CHECK(!strstr(ran.err, "warning"), "%s: %s", name, ran.err);
+        assert_int_equal(losses(out + 11, loss, 64), 50);
+        for (int k = 0; k < 50; k++) CHECK(isfinite(loss[k]), "%s: loss of step %d is %g", name, k, loss[k]);
+        if (i % 5) continue;
+        int status = RUN_PROGRAM(sampler, "clips/a", "--model", model_of, "-o", name, "--steps", "1", "--no-mp4");
+        CHECK(status == 0, "%s: %s", name, ran.err);
+    }
+}
+
+/* 20 steps, or 10 and 10 more, on 1, 2, 3 threads: the same bits. */
+static void stopped_and_resumed(void **state)
+{
+    (void)state;
+    static const char *const threads[] = { "1", "2", "3" };
+    GOOD("lora.json", SET("output_dir=whole"), SET("max_train_steps=20"), SET("gradient_accumulation_steps=2"));
+    for (size_t i = 0; i < DAR_COUNT(threads); i++) {
+        char out[64], run[32], at[64];
+        snprintf(run, sizeof run, "parts-%s", threads[i]);
+        snprintf(out, sizeof out, "output_dir=%s", run);
+        GOOD("lora.json", SET(out), SET("max_train_steps=10"), SET("gradient_accumulation_steps=2"), "--threads",
+             threads[i]);
+        GOOD("lora.json", SET(out), SET("max_train_steps=20"), SET("gradient_accumulation_steps=2"), "--threads",
+             threads[i], "--resume", "auto");
+        snprintf(at, sizeof at, "%s/checkpoint-20", run);
+        same_state("whole/checkpoint-20", at);
+    }
+}
+
+/* Asked to stop, a run saves and says so; then it goes on. */
+static void interrupted(void **state)
+{
+    (void)state;
+    pid_t pid = run_start(
+        program, (const char *const[]){ "lora.json", SET("output_dir=stopped"), SET("max_train_steps=1000000"), NULL });
+    for (int i = 0; i < 3000 && !run_is_there("stopped/log.jsonl"); i++) usleep(10000);
+    usleep(100000);
+    kill(pid, SIGTERM);
+    int status = run_finish(pid);
+    CHECK(status == 130 && strstr(ran.err, "saved after step"), "status %d: %s", status, ran.err);
+    BAD(2, "checkpoint", "lora.json", SET("output_dir=stopped"));
+}
+
+/* The same losses in bf16, within what its operands' 8 bits do in a network of two layers: a loss is a mean of squares
+ * over 600 numbers, each off by some 1e-2. */
+static void precisions(void **state)
+{
+    (void)state;
+    double wide[32], narrow[32];
+    GOOD("lora.json", SET("output_dir=f32"), SET("max_train_steps=30"));
+    GOOD("lora.json", SET("output_dir=bf16"), SET("max_train_steps=30"), SET("mixed_precision=bf16"));
+    assert_int_equal(losses("f32", wide, 32), 30);
+    assert_int_equal(losses("bf16", narrow, 32), 30);
+    double most = 0;
+    for (int k = 0; k < 30; k++) most = fmax(most, fabs(narrow[k] / wide[k] - 1));
+    printf("note: losses in bf16 off by at most %.1e\n", most);
+    CHECK_NEAR("loss in bf16 against f32", most, 0, 1e-2);
+}
+
+static void refusals(void **state)
+{
+    (void)state;
+    BAD(2, "expected bundles", "lora.json", SET("data=[]"));
+    BAD(2, "found no bundle", "lora.json", SET("data=[\"small\"]"));
+    BAD(2, "large", "lora.json", SET("data=[\"clips\", \"large\"]"), SET("output_dir=bad"));
+    BAD(2, "found 1 frame", "lora.json", SET("data=[\"one\"]"), SET("output_dir=bad"));
+    BAD(2, "did you mean 'rank'?", "lora.json", SET("ran=5"));
+    BAD(2, "no weights of the dit", "lora.json", SET("model=small"), SET("output_dir=bad"));
+    BAD(3, "this run needs", "lora.json", SET("output_dir=bad"), "--mem-budget", "0.000001");
+    CHECK(!run_is_there("bad"), "what was refused left a directory");
+}
+
+int main(int argc, char **argv)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),  cmocka_unit_test(stopped_and_resumed),
+        cmocka_unit_test(interrupted), cmocka_unit_test(precisions), cmocka_unit_test(refusals),
+    };
+    (void)argc;
+    if (!run_find(program, argv[0], "dar-train") || !run_find(bundler, argv[0], "dar-bundle") ||
+        !run_find(sampler, argv[0], "dar-sample"))
+        return 1;
+    return cmocka_run_group_tests(tests, setup, teardown) != 0;
+}
