@@ -12,8 +12,12 @@
 #define LONGEST 2    /* [m] of a way that the area makes room for */
 #define STILLS  9    /* things beside the animated ones, at most */
 
+#define HIDDEN 0.25 /* share of the frames in which something may stand before the subject */
+#define ZOOMS  4    /* lenses, each ZOOM as wide as the one before, that are tried on a path */
+#define ZOOM   0.75
+
 #define GROUND_DEPTH   0.3  /* [m] */
-#define LARGEST_GROUND 1.43 /* half its longest side, in radii of the area */
+#define LARGEST_GROUND 1.43 /* half its longest side, in radii of the area, where the camera keeps its reach */
 
 dar_synth_plan dar_synth_standard(void)
 {
@@ -208,8 +212,8 @@ static void add_ground(struct work *w)
 {
     dar_maker *m = &w->maker;
     dar_dice *d = &w->dice;
-    double r = w->out->radius * dar_dice_in(d, 1.06, 1.3), thick = dar_dice_in(d, 0.08, GROUND_DEPTH - 0.01),
-           top = -0.004;
+    double r = w->out->radius * dar_dice_in(d, 1.06, w->plan->reach > 0 ? 1.3 : 1.6),
+           thick = dar_dice_in(d, 0.08, GROUND_DEPTH - 0.01), top = -0.004;
     size_t form = dar_dice_below(d, 3);
     m->look = dar_dice_for(w->plan->look, "ground", 0);
     const dar_paint_style style = { .palette = DAR_NONE, .contrast = dar_dice_in(&m->look, 0.35, 0.9) };
@@ -270,27 +274,88 @@ static dar_box *cover_things(struct work *w)
     return box;
 }
 
-/* First close to the things, then, if that is not safe, around the ground too. */
+/* What fills the picture: the subject, and of the way from it to all the others a share that is the scene's. */
+static dar_box *cover_subject(struct work *w, const dar_box *things)
+{
+    dar_dice d = dar_dice_for(w->plan->seed, "frame", 0);
+    dar_box *box = room(w, w->plan->frames, sizeof *box);
+    double share = dar_dice_in(&d, 0, 0.6);
+    for (size_t t = 0; t < w->plan->frames; t++) {
+        box[t] = w->out->thing[0].box[t];
+        for (int k = 0; k < 3; k++) {
+            box[t].lo[k] += share * (things[t].lo[k] - box[t].lo[k]);
+            box[t].hi[k] += share * (things[t].hi[k] - box[t].hi[k]);
+        }
+    }
+    return box;
+}
+
+/* Where a segment from a to b is in the box: whether it is. */
+static bool is_between(const dar_box *box, const double a[3], const double b[3])
+{
+    double in = 0, out = 1;
+    for (int k = 0; k < 3; k++) {
+        double way = b[k] - a[k], lo = (box->lo[k] - a[k]) / way, hi = (box->hi[k] - a[k]) / way;
+        if (way == 0 && (a[k] < box->lo[k] || a[k] > box->hi[k])) return false;
+        if (way == 0) continue;
+        in = fmax(in, fmin(lo, hi));
+        out = fmin(out, fmax(lo, hi));
+    }
+    return in <= out;
+}
+
+/* Whether the subject's middle is seen most of the time. */
+static bool is_seen(const struct work *w)
+{
+    const dar_synth *o = w->out;
+    size_t hidden = 0;
+    for (size_t t = 0; t < w->plan->frames; t++) {
+        double eye[3], middle[3];
+        bool seen = true;
+        for (int k = 0; k < 3; k++) {
+            eye[k] = o->cameras.view[t].c2w[4 * k + 3];
+            middle[k] = (o->thing[0].box[t].lo[k] + o->thing[0].box[t].hi[k]) / 2;
+        }
+        for (size_t i = 1; i < o->things; i++) seen = seen && !is_between(&o->thing[i].box[t], eye, middle);
+        hidden += !seen;
+    }
+    return (double)hidden <= HIDDEN * (double)w->plan->frames;
+}
+
+/* The path around the stage's boxes, from outside of `all`: the nearer, the wider the lens. */
+static bool goes_around(struct work *w, dar_stage stage, const dar_stage *all)
+{
+    dar_synth *o = w->out;
+    size_t frame;
+    for (int i = 0; i < ZOOMS; i++, stage.fov *= ZOOM)
+        if (dar_trajectory_path(&o->path, &stage, &o->cameras, NULL) == DAR_OK &&
+            dar_trajectory_check(&o->cameras, all, &frame) == DAR_PATH_SAFE)
+            return true;
+    return false;
+}
+
+/* First close to the subject; if that is not safe, or hides it, around all things, then around the ground too. */
 static dar_status find_path(struct work *w, dar_err *e)
 {
     dar_synth *o = w->out;
     const dar_synth_plan *p = w->plan;
+    const double r = p->reach, m = 0.45 * r;
+    const dar_box within = { { -r, -GROUND_DEPTH, -r }, { r, r, r } }, amid = { { -m, 0, -m }, { m, m, m } };
     dar_dice d = dar_dice_for(p->view, "camera", 0);
     dar_stage all = dar_stage_standard();
     all.boxes = p->frames, all.box = o->box, all.width = p->width, all.height = p->height;
     if (!p->path) all.fov = dar_dice_in(&d, 28, 50) * M_PI / 180;
-    dar_stage things = all;
-    const dar_box around = { { -p->reach, -GROUND_DEPTH, -p->reach }, { p->reach, p->reach / 2, p->reach } };
+    dar_stage things = all, near = all;
     things.box = cover_things(w);
-    if (p->reach > 0) things.box = &around, things.boxes = 1;
+    near.box = cover_subject(w, things.box);
+    if (r > 0) all.box = &within, near.box = &amid, all.boxes = near.boxes = 1;
     DAR_TRY(dar_camera_init(&o->cameras, p->frames, e));
     for (o->paths = 0; o->paths < PATHS; o->paths++) {
-        size_t frame;
         o->path = dar_trajectory_draw(p->path ? p->path : draw_path(&d), p->view, o->paths);
-        if (dar_trajectory_path(&o->path, &things, &o->cameras, NULL) == DAR_OK &&
-            dar_trajectory_check(&o->cameras, &all, &frame) == DAR_PATH_SAFE)
+        if (goes_around(w, near, &all) && (r > 0 || is_seen(w))) return DAR_OK;
+        if (r > 0 || (!p->path && o->paths < PATHS / 2)) continue;
+        if (goes_around(w, things, &all) || dar_trajectory_path(&o->path, &all, &o->cameras, NULL) == DAR_OK)
             return DAR_OK;
-        if (p->reach <= 0 && dar_trajectory_path(&o->path, &all, &o->cameras, NULL) == DAR_OK) return DAR_OK;
     }
     return dar_fail(e, DAR_ERR_CHECK, "seed %llu: found no safe camera path in %d", (unsigned long long)p->view, PATHS);
 }

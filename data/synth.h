@@ -6,8 +6,9 @@
  *     ... s.clip, s.cameras, s.lighting, s.box, s.world: what data/render.h and data/shade.h want ...
  *     dar_synth_free(&s);
  *
- * A subject in the middle, other things around it, a ground below.  The camera path is fitted to the things, so the
- * ground may be cut by the picture's edge.  Same plan, same bits, on any number of threads.
+ * A subject in the middle, other things around it, a ground below.  The camera path is fitted to the subject and as
+ * much around it as the scene draws, so other things and the ground may be cut by the picture's edge.  Same plan, same
+ * bits, on any number of threads.
  *
  * Source: the paper, 4.2. */
 #ifndef DAR_DATA_SYNTH_H
@@ -27,7 +28,7 @@ typedef struct dar_synth_plan {
     const dar_asset_kind *subject;   /* NULL: drawn from the set */
     const dar_trajectory_kind *path; /* NULL: drawn from the archetypes, all but those of the benchmark */
     bool alone;                      /* no second thing that moves by itself, and few others */
-    double reach; /* > 0: the camera goes around this box, whatever is in it: x, z to +-reach, y to reach / 2 [m] */
+    double reach;      /* > 0: the camera goes around this box, whatever is in it: x, z to +-reach, y to reach [m] */
     int width, height; /* [px] */
     size_t frames;
     double fps;
