@@ -8,7 +8,8 @@
  *   forward   Overwrites y, and aux if it is there (aux.data is NULL when nobody will call backward).
  *
  *   backward  For each i with gx[i].data: gx[i] = (add[i] ? gx[i] : 0) + J_i^T gy.  Reads aux, gy, and of the x[i]
- *             and y only those named in `keep`.  The gx[i] never overlap.
+ *             and y only those named in `keep`.  The gx[i] never overlap; gx[0] is gy itself where the op is
+ *             `in_place` and nobody else needs gy.
  *
  *   both      Allocate nothing and keep no state; scratch comes with the context, of the size that `scratch` asked
  *             for.  Every tensor is contiguous.  The same bits for any number of threads.
@@ -62,6 +63,7 @@ typedef struct dar_op {
     int n_optional;
     bool variadic;
     bool strided;     /* forward takes strided views as they are */
+    bool in_place;    /* gx[0] may lie where gy lies, if x[0] has y's shape: then add[0] is false */
     unsigned keep;    /* what backward reads */
     unsigned frozen;  /* DAR_KEEP_X bits of inputs that never get a gradient (positions, masks) */
     size_t attr_size; /* bytes copied onto the tape */

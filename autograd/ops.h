@@ -112,6 +112,7 @@ typedef struct dar_linear_opt {
     bool cast;   /* y has storage type `out`, not that of x */
     dar_dtype out;
     bool quantise; /* linear with i8 w: forward rounds the rows of x to 8 bits too, and multiplies 8 bits by 8 bits */
+    dar_keep keep; /* in a recompute segment (dar_apply_kept) */
 } dar_linear_opt;
 
 /* y = act(x W^T + b).
@@ -138,7 +139,7 @@ typedef struct dar_attention_opt {
     int64_t heads;
     double scale;        /* 0: 1 / sqrt(E) */
     dar_val *log_weight; /* [Nk] or [B, Nk], f32 or f64, frozen: added to the logits of each key; NULL: none */
-    bool keep;           /* in a recompute segment: keep the result (dar_apply_kept) */
+    dar_keep keep;       /* in a recompute segment (dar_apply_kept) */
 } dar_attention_opt;
 
 /* Attention over D = heads E columns, head by head.

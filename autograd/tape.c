@@ -8,7 +8,7 @@
 #include "lib/thread.h"
 
 #define META_BYTES ((size_t)256 << 20) /* address space; pages are taken as they are used */
-#define MAX_KEPT   4                   /* results one segment can keep */
+#define MAX_KEPT   8                   /* results one segment can keep */
 
 struct dar_spare {
     struct dar_spare *next;
@@ -21,7 +21,7 @@ struct kept {
 };
 
 struct dar_keeping {
-    int n, at; /* kept so far; next to be replayed */
+    int at; /* the next to be kept, or replayed */
     struct kept of[MAX_KEPT];
 };
 
@@ -171,15 +171,31 @@ static void fill_inputs(dar_opctx *c, dar_val *const *in, int n)
     }
 }
 
+/* How a call differs from a plain one. */
+struct how {
+    dar_arena *y, *aux;       /* where these go */
+    bool save;                /* aux is made even though nothing is recorded */
+    const struct kept *ready; /* y and aux are known from before */
+    struct kept *made;        /* gets y and aux */
+};
+
+/* In a replay: an input without value (DAR_KEEP_AUX). */
+static bool lost(const dar_tape *t, dar_val *const *in, int n)
+{
+    bool any = false;
+    for (int i = 0; i < n; i++) any |= in[i] && !in[i]->x.data;
+    return any && t->replaying;
+}
+
 /* y and, where backward will want it, aux: computed, or known from before. */
-static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool save, const struct kept *ready)
+static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool without, const struct how *how)
 {
     dar_shape shape[DAR_OP_IN];
     dar_dtype type[DAR_OP_IN];
 
-    if (ready) {
-        c->y = ready->y;
-        c->aux = ready->aux;
+    if (how->ready) {
+        c->y = how->ready->y;
+        c->aux = how->ready->aux;
         return;
     }
     if (op->view) {
@@ -190,8 +206,11 @@ static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool sav
         shape[i] = c->x[i].shape;
         type[i] = c->x[i].dtype;
     }
-    c->y = dar_tensor_push(t->arena, op->dtype ? op->dtype(type, n, c->attr) : type[0], op->shape(shape, n, c->attr));
-    if (op->aux && save) c->aux = dar_tensor_push(t->arena, dar_op_compute(c), op->aux(shape, n, c->attr));
+    c->y = dar_tensor_of(op->dtype ? op->dtype(type, n, c->attr) : type[0], op->shape(shape, n, c->attr), NULL);
+    DAR_ASSERT(!without || !op->aux, "%s: an input has no value in the replay, and backward needs it", op->name);
+    if (without) return;
+    c->y = dar_tensor_push(how->y, c->y.dtype, c->y.shape);
+    if (op->aux && how->save) c->aux = dar_tensor_push(how->aux, dar_op_compute(c), op->aux(shape, n, c->attr));
     run(t, op, c, false);
     look(t, op->name, &c->y, false);
 }
@@ -205,9 +224,7 @@ static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val
     t->last = node;
 }
 
-/* The call itself.  ready: y and aux are known from before.  made: give y and aux even though nothing is recorded. */
-static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n, const void *attr,
-                     const struct kept *ready, struct kept *made)
+static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n, const void *attr, struct how how)
 {
     dar_val *in[DAR_OP_IN] = { 0 };
     dar_opctx c = { .attr = attr };
@@ -223,25 +240,18 @@ static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n
     wants &= t->recording;
     DAR_ASSERT(!wants || op->backward || op->view, "%s: no gradient: %s", op->name, op->no_backward);
     fill_inputs(&c, in, n);
-    compute(t, op, &c, n, wants || made, ready);
+    how.save |= wants;
+    compute(t, op, &c, n, lost(t, in, n), &how);
     dar_val *y = push_val(t, c.y);
     y->wants_grad = wants;
     if (wants) push_node(t, op, &c, in, n, y);
-    if (made) *made = (struct kept){ c.y, c.aux };
+    if (how.made) *how.made = (struct kept){ c.y, c.aux };
     return y;
 }
 
 dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr)
 {
-    return call(t, op, in, n, attr, NULL, NULL);
-}
-
-static dar_tensor copy_to(dar_arena *a, const dar_tensor *x)
-{
-    if (!x->data) return *x;
-    dar_tensor y = dar_tensor_push(a, x->dtype, x->shape);
-    if (!a->plan) dar_tensor_copy(&y, x);
-    return y;
+    return call(t, op, in, n, attr, (struct how){ .y = t->arena, .aux = t->arena });
 }
 
 /* ---------------------------------------------------------------- backward */
@@ -301,6 +311,15 @@ static bool taken(const dar_opctx *c, int i, const dar_val *v)
     return false;
 }
 
+/* Where an op works in place and nobody else has given x[0] a gradient yet, the buffer is handed on. */
+static void hand_on(const dar_op *op, dar_val *x, dar_val *y)
+{
+    if (!op->in_place || !grad_goes_to(op, x, 0) || x->g.data || y->leaf) return;
+    if (!dar_shape_equal(&x->x.shape, &y->x.shape) || dar_compute_type(x->x.dtype) != y->g.dtype) return;
+    x->g = y->g;
+    y->g.data = NULL;
+}
+
 static void op_backward(dar_tape *t, const dar_node *node)
 {
     const dar_op *op = node->op;
@@ -308,6 +327,7 @@ static void op_backward(dar_tape *t, const dar_node *node)
     bool apart[DAR_OP_IN] = { false };
 
     fill_inputs(&c, node->in, node->n);
+    hand_on(op, node->in[0], node->y);
     for (int i = 0; i < node->n; i++)
         if (grad_goes_to(op, node->in[i], i)) ensure_grad(t, node->in[i]);
     dar_mark m = dar_arena_mark(t->arena);
@@ -381,7 +401,8 @@ static void segment_backward(dar_tape *t, const dar_node *node)
     t->spare = NULL;
     t->last = NULL;
     t->oldest = t->meta.base + t->meta.used;
-    t->kept = node->kept;
+    t->kept = t->keep ? node->kept : NULL;
+    node->kept->at = 0;
     t->replaying = true;
     stand_in(t, node, in);
     dar_val *y = node->fn(t, node->arg, in);
@@ -452,16 +473,22 @@ dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const 
     return y;
 }
 
-dar_val *dar_apply_kept(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr)
+dar_val *dar_apply_kept(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr, dar_keep keep)
 {
     struct dar_keeping *k = t->kept;
+    struct how how = { .y = t->arena, .aux = t->arena };
 
-    if (k && t->replaying && k->at < k->n) return call(t, op, in, n, attr, &k->of[k->at++], NULL);
-    if (k && !t->replaying && k->n < MAX_KEPT) {
-        struct kept made;
-        dar_val *y = call(t, op, in, n, attr, NULL, &made);
-        k->of[k->n++] = (struct kept){ copy_to(t->keep, &made.y), copy_to(t->keep, &made.aux) };
-        return y;
+    if (!k || !keep || k->at == MAX_KEPT) return call(t, op, in, n, attr, how);
+    struct kept *slot = &k->of[k->at++];
+    if (t->replaying) {
+        how.ready = slot;
+        return call(t, op, in, n, attr, how);
     }
-    return call(t, op, in, n, attr, NULL, NULL);
+    how.aux = t->keep;
+    if (keep == DAR_KEEP_ALL) how.y = t->keep;
+    how.save = true;
+    how.made = slot;
+    dar_val *y = call(t, op, in, n, attr, how);
+    if (keep == DAR_KEEP_AUX) slot->y.data = NULL;
+    return y;
 }

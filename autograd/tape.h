@@ -99,8 +99,16 @@ typedef dar_val *dar_segment_fn(dar_tape *t, void *arg, dar_val *const *in);
 dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const *in, int n, dar_dtype type,
                      dar_shape shape);
 
-/* Run op as dar_apply does; inside a segment, keep its result and statistics in the keep arena, so that the replay need
- * not compute it again.  Worth it where recomputation is dear and results are small: attention. */
-dar_val *dar_apply_kept(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr);
+/* What a call inside a segment leaves in the keep arena, so that the replay need not run it again.  Worth it where
+ * recomputation is dear and results are small: products, attention. */
+typedef enum dar_keep {
+    DAR_KEEP_NOTHING,
+    DAR_KEEP_ALL, /* the result and what backward saves */
+    DAR_KEEP_AUX, /* what backward saves: in the replay the result, and all that is made of it, has no value (data
+                     NULL), so nobody's backward may read it */
+} dar_keep;
+
+/* Run op as dar_apply does.  Outside of segments nothing is kept; in a segment, at most 8 results are. */
+dar_val *dar_apply_kept(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr, dar_keep keep);
 
 #endif

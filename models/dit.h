@@ -44,6 +44,18 @@ typedef struct dar_dit_block {
     dar_param *norm3_w, *norm3_b;     /* before cross-attention */
 } dar_dit_block;
 
+/* What backward computes again, to save memory; from the least memory to the least time.  What is not computed again
+ * lies in the tape's keep arena; without one, all is. */
+typedef enum dar_dit_replay {
+    DAR_REPLAY_ALL,
+    DAR_REPLAY_PRODUCTS, /* all but attention */
+    DAR_REPLAY_CHEAP,    /* norms, modulation, rotation, activations: a few percent of the time */
+    DAR_REPLAY_NOTHING,
+    DAR_REPLAYS
+} dar_dit_replay;
+
+extern const char *const dar_dit_replay_name[DAR_REPLAYS + 1]; /* "all", "products", "cheap", "nothing", NULL */
+
 typedef struct dar_dit {
     dar_dit_config c;
     dar_dtype storage, main;
@@ -55,8 +67,7 @@ typedef struct dar_dit {
     dar_adapter adapter;
 
     bool quantise; /* products whose weights are stored in 8 bits round their operands too: faster, less exact */
-    bool whole;    /* record blocks as they are, not as recompute segments: faster, more memory */
-    bool keep;     /* keep the results of attention for the replay of a segment (tape.keep) */
+    dar_dit_replay replay;
 } dar_dit;
 
 /* Declare all parameters, under the names of the public checkpoint.  m->block is on the heap. */
@@ -130,8 +141,9 @@ dar_val *dar_dit_head(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, con
 dar_val *dar_dit_block_forward(dar_tape *t, const dar_dit *m, int block, const dar_dit_scene *s, const dar_dit_text *x,
                                dar_val *e0, dar_val *tokens);
 
-/* A product with its low-rank addition; operands of the storage type, activation as asked. */
-dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *p, dar_act act, dar_val *x);
+/* A product with its low-rank addition; operands of the storage type, activation and what is kept as asked. */
+dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *p, dar_act act, dar_keep keep,
+                          dar_val *x);
 
 /* ---------------------------------------------------------------- what is known of the video */
 

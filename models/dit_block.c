@@ -3,9 +3,12 @@
 
 enum { SHIFT, SCALE, GATE };
 
-dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *p, dar_act act, dar_val *x)
+const char *const dar_dit_replay_name[] = { "all", "products", "cheap", "nothing", NULL };
+
+dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *p, dar_act act, dar_keep keep,
+                          dar_val *x)
 {
-    dar_linear_opt o = { .act = act, .quantise = m->quantise };
+    dar_linear_opt o = { .act = act, .quantise = m->quantise, .keep = keep };
     dar_val *w = dar_param_operand(t, p->w, m->storage), *b = dar_param_leaf(t, p->b);
     if (!p->down || p->merged) return dar_linear(t, x, w, b, &o);
     return dar_lora(t, x, w, b, dar_param_leaf(t, p->down), dar_param_leaf(t, p->up), p->scale, &o);
@@ -18,6 +21,8 @@ struct block {
     dar_val *log_weight; /* a leaf */
     dar_val *e0, *k, *v; /* inputs of a segment: in a replay, what stands for them */
     bool rest;           /* of the first frame nothing is wanted but that the others see it */
+    int from, to;        /* parts */
+    bool cheap;          /* a segment that keeps its products */
 };
 
 /* Rows [B, R, ..] of modulations, as the frames after the first take them. */
@@ -44,7 +49,29 @@ static void modulations(dar_tape *t, const struct block *a, int first, dar_val *
 
 static dar_val *product(dar_tape *t, const struct block *a, dar_projection which, dar_val *x)
 {
-    return dar_dit_multiply(t, a->m, &a->b->product[which], which == DAR_FFN_UP ? DAR_ACT_GELU_TANH : DAR_ACT_NONE, x);
+    dar_keep keep = a->cheap ? DAR_KEEP_ALL : DAR_KEEP_NOTHING;
+    return dar_dit_multiply(t, a->m, &a->b->product[which], DAR_ACT_NONE, keep, x);
+}
+
+/* The last product of a part, whose result only the residual reads: backward needs it for the gradient of its gate. */
+static dar_val *last_product(dar_tape *t, const struct block *a, dar_projection which, dar_val *x, bool gated)
+{
+    bool trained = gated && (a->e0->wants_grad || a->b->modulation->g.data);
+    dar_keep keep = !a->cheap ? DAR_KEEP_NOTHING : trained ? DAR_KEEP_ALL : DAR_KEEP_AUX;
+    return dar_dit_multiply(t, a->m, &a->b->product[which], DAR_ACT_NONE, keep, x);
+}
+
+/* gelu(x W^T + b).  The activation is part of the product but where it is computed again: its argument, in the storage
+ * type, is then all that is kept. */
+static dar_val *activated(dar_tape *t, const struct block *a, dar_val *x)
+{
+    if (a->cheap) return dar_gelu_tanh(t, product(t, a, DAR_FFN_UP, x));
+    return dar_dit_multiply(t, a->m, &a->b->product[DAR_FFN_UP], DAR_ACT_GELU_TANH, DAR_KEEP_NOTHING, x);
+}
+
+static dar_keep keep_attention(const struct block *a)
+{
+    return a->m->replay == DAR_REPLAY_ALL ? DAR_KEEP_NOTHING : DAR_KEEP_ALL;
 }
 
 static dar_val *rms(dar_tape *t, const struct block *a, const dar_param *w, dar_val *x)
@@ -61,7 +88,7 @@ static dar_norm_opt norm_before(const struct block *a)
 /* x [B, L, D] -> [B, L, D], all three; with a->rest self-attention gives the tokens after the first frame's alone */
 static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
 {
-    dar_attention_opt o = { .heads = a->m->c.heads, .keep = a->m->keep };
+    dar_attention_opt o = { .heads = a->m->c.heads, .keep = keep_attention(a) };
     dar_norm_opt norm = norm_before(a);
     dar_val *mod[3];
 
@@ -75,17 +102,17 @@ static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
     }
     dar_val *q = dar_rope(t, rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h)), rope);
     h = dar_attention(t, q, k, v, &o);
-    return dar_gate(t, x, product(t, a, DAR_SELF_O, h), mod[GATE], a->s->frame);
+    return dar_gate(t, x, last_product(t, a, DAR_SELF_O, h, true), mod[GATE], a->s->frame);
 }
 
 static dar_val *cross_attention(dar_tape *t, const struct block *a, dar_val *x)
 {
-    dar_attention_opt o = { .heads = a->m->c.heads, .keep = a->m->keep, .log_weight = a->log_weight };
+    dar_attention_opt o = { .heads = a->m->c.heads, .keep = keep_attention(a), .log_weight = a->log_weight };
     dar_norm_opt norm = norm_before(a);
     dar_val *h = dar_layer_norm(t, x, dar_param_leaf(t, a->b->norm3_w), dar_param_leaf(t, a->b->norm3_b), &norm);
     dar_val *q = rms(t, a, a->b->norm_q[1], product(t, a, DAR_CROSS_Q, h));
     h = dar_attention(t, q, a->k, a->v, &o);
-    return dar_add(t, x, product(t, a, DAR_CROSS_O, h));
+    return dar_add(t, x, last_product(t, a, DAR_CROSS_O, h, false));
 }
 
 static dar_val *feed_forward(dar_tape *t, const struct block *a, dar_val *x)
@@ -95,7 +122,7 @@ static dar_val *feed_forward(dar_tape *t, const struct block *a, dar_val *x)
 
     modulations(t, a, 3, mod);
     dar_val *h = dar_modulate(t, x, mod[SCALE], mod[SHIFT], &norm);
-    h = product(t, a, DAR_FFN_DOWN, product(t, a, DAR_FFN_UP, h));
+    h = last_product(t, a, DAR_FFN_DOWN, activated(t, a, h), true);
     return dar_gate(t, x, h, mod[GATE], a->s->frame);
 }
 
@@ -103,12 +130,12 @@ typedef dar_val *part_fn(dar_tape *t, const struct block *a, dar_val *x);
 static part_fn *const parts[] = { self_attention, cross_attention, feed_forward };
 
 /* in: x, e0, k, v */
-static dar_val *block(dar_tape *t, void *arg, dar_val *const *in)
+static dar_val *run_parts(dar_tape *t, void *arg, dar_val *const *in)
 {
     struct block a = *(const struct block *)arg;
     dar_val *x = in[0];
     a.e0 = in[1], a.k = in[2], a.v = in[3];
-    for (size_t i = 0; i < DAR_COUNT(parts); i++) x = parts[i](t, &a, x);
+    for (int i = a.from; i < a.to; i++) x = parts[i](t, &a, x);
     return x;
 }
 
@@ -116,21 +143,30 @@ static dar_val *block(dar_tape *t, void *arg, dar_val *const *in)
 
 static struct block block_of(const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x, dar_val *e0)
 {
-    return (struct block){ m, &m->block[i], s, x->log_weight, e0, x->k[i], x->v[i], false };
+    return (struct block){ m, &m->block[i], s, x->log_weight, e0, x->k[i], x->v[i], false, 0, DAR_COUNT(parts), false };
 }
 
 dar_val *dar_dit_block_forward(dar_tape *t, const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x,
                                dar_val *e0, dar_val *tokens)
 {
     struct block a = block_of(m, i, s, x, e0);
-    return block(t, &a, (dar_val *[]){ tokens, e0, x->k[i], x->v[i] });
+    return run_parts(t, &a, (dar_val *[]){ tokens, e0, x->k[i], x->v[i] });
 }
 
-static dar_val *segment(dar_tape *t, const struct block *b, dar_val *tokens)
+/* A block as a segment; where little is computed again, a segment for each part: only one at a time is then whole. */
+static dar_val *segments(dar_tape *t, const struct block *b, dar_val *tokens)
 {
-    struct block *a = dar_tape_store(t, b, sizeof *b);
-    dar_val *in[] = { tokens, a->e0, a->k, a->v };
-    return dar_segment(t, block, a, in, DAR_COUNT(in), tokens->x.dtype, tokens->x.shape);
+    bool cheap = b->m->replay == DAR_REPLAY_CHEAP && t->keep;
+    int step = cheap ? 1 : DAR_COUNT(parts);
+    for (int i = 0; i < (int)DAR_COUNT(parts); i += step) {
+        struct block *a = dar_tape_store(t, b, sizeof *b);
+        dar_val *in[] = { tokens, a->e0, a->k, a->v };
+        a->from = i;
+        a->to = i + step;
+        a->cheap = cheap;
+        tokens = dar_segment(t, run_parts, a, in, DAR_COUNT(in), tokens->x.dtype, tokens->x.shape);
+    }
+    return tokens;
 }
 
 static void in_place(dar_tape *t, part_fn *part, const struct block *a, dar_val *from, dar_val *to)
@@ -186,8 +222,8 @@ dar_val *dar_dit_blocks(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, c
     }
     for (int i = 0; i < m->c.layers; i++) {
         struct block a = block_of(m, i, s, x, e->e0);
-        if (m->whole) tokens = dar_dit_block_forward(t, m, i, s, x, e->e0, tokens);
-        else tokens = segment(t, &a, tokens);
+        if (m->replay == DAR_REPLAY_NOTHING) tokens = dar_dit_block_forward(t, m, i, s, x, e->e0, tokens);
+        else tokens = segments(t, &a, tokens);
     }
     return tokens;
 }

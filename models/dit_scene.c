@@ -106,9 +106,9 @@ void dar_dit_text_prepare(dar_tape *t, const dar_dit *m, const dar_tensor *text,
     x->v = dar_tape_room(t, pointers);
     for (int i = 0; i < m->c.layers; i++) {
         const dar_dit_block *b = &m->block[i];
-        dar_val *k = dar_dit_multiply(t, m, &b->product[DAR_CROSS_K], DAR_ACT_NONE, h);
+        dar_val *k = dar_dit_multiply(t, m, &b->product[DAR_CROSS_K], DAR_ACT_NONE, DAR_KEEP_NOTHING, h);
         x->k[i] = dar_rms_norm(t, k, dar_param_leaf(t, b->norm_k[1]), &rms);
-        x->v[i] = dar_dit_multiply(t, m, &b->product[DAR_CROSS_V], DAR_ACT_NONE, h);
+        x->v[i] = dar_dit_multiply(t, m, &b->product[DAR_CROSS_V], DAR_ACT_NONE, DAR_KEEP_NOTHING, h);
     }
 }
 

@@ -1,5 +1,5 @@
 /* bench_net.c: rows of whole blocks of the transformer (models/dit.h): inference, and a training step of rank-32 LoRA
- * (forward, loss, backward; nothing recomputed).  Keys and values of the text are made each time. */
+ * (forward, loss, backward; only what is cheap is computed again).  Keys and values of the text are made each time. */
 #include "tests/bench.h"
 
 #include "lib/status.h"
@@ -15,8 +15,9 @@ struct network {
 
 /* Sizes of a row: blocks, tokens (frames of 16 x 16), text tokens, width, heads, feed-forward width. */
 struct state {
-    struct network trained, plain; /* with LoRA; with its own weights alone, as after merging */
+    struct network trained, plain; /* with LoRA; with the same weights alone, as after merging */
     dar_tensor tokens, text, target, rope, e0;
+    dar_arena keep;
 };
 
 static dar_val *run(bench *b, const dar_dit *m)
@@ -56,7 +57,14 @@ static double planned(bench *b, void (*fn)(bench *b))
     return flops;
 }
 
-static void make(bench *b, struct network *n, int64_t rank)
+static void reset(bench *b)
+{
+    bench_op_reset(b);
+    dar_arena_reset(b->tape.keep, 0);
+}
+
+/* share: whose weights it has; NULL: its own. */
+static void make(bench *b, struct network *n, int64_t rank, const struct network *share)
 {
     const int64_t *s = b->s;
     dar_dit_config c = { .layers = s[0], .width = s[3], .heads = s[4], .ffn = s[5] };
@@ -71,20 +79,21 @@ static void make(bench *b, struct network *n, int64_t rank)
     dar_dit_init(&n->m, &n->p, &c, &(dar_adapter_config){ .unshuffle = 1 });
     dar_lora_init(&n->m, &n->p, &(dar_lora_config){ .rank = rank, .alpha = 1, .targets = DAR_PROJECTIONS_ALL });
     dar_params_train(&n->p, DAR_PARAM_LORA);
+    for (size_t i = 0; share && i < n->p.count; i++) dar_param_bind(&n->p, n->p.at[i], &share->p.at[i]->x);
     dar_params_fresh(&n->p, DAR_PARAM_ALL, 1);
     dar_params_gradients(&n->p);
-    n->m.whole = true;
+    n->m.replay = DAR_REPLAY_CHEAP;
 }
 
 static void setup(bench *b)
 {
     static struct state only;
     struct state *s = b->state = &only;
-    dar_arena plan;
+    dar_arena plan, plan_keep;
     dar_err e;
 
-    make(b, &s->plain, 0);
-    make(b, &s->trained, RANK);
+    make(b, &s->trained, RANK, NULL);
+    make(b, &s->plain, 0, &s->trained);
     dar_dtype type = s->plain.p.main;
     s->tokens = bench_tensor(b, type, DAR_SHAPE(1, b->s[1], b->s[3]));
     s->target = bench_tensor(b, type, s->tokens.shape);
@@ -94,16 +103,22 @@ static void setup(bench *b)
     dar_rope_table(&s->rope, b->s[1] / 256, 16, 16);
 
     DAR_ASSERT(dar_arena_init_plan(&plan, "plan", &e) == DAR_OK, "%s", e.text);
+    DAR_ASSERT(dar_arena_init_plan(&plan_keep, "plan", &e) == DAR_OK, "%s", e.text);
     DAR_ASSERT(dar_tape_init(&b->tape, &plan, &e) == DAR_OK, "%s", e.text);
+    b->tape.keep = &plan_keep;
     b->flops[0] = planned(b, forward);
     b->flops[1] = planned(b, step);
+    dar_arena_free(&s->keep); /* of the row before */
+    DAR_ASSERT(dar_arena_init(&s->keep, "keep", plan_keep.peak, &e) == DAR_OK, "%s", e.text);
     dar_arena_free(&plan);
+    dar_arena_free(&plan_keep);
     b->tape.arena = b->arena;
+    b->tape.keep = &s->keep;
     b->mark = dar_arena_mark(b->arena);
 }
 
 static const bench_kind blocks = {
-    .part = { "blocks", "blocks_step" }, .setup = setup, .run = { forward, step }, .reset = bench_op_reset
+    .part = { "blocks", "blocks_step" }, .setup = setup, .run = { forward, step }, .reset = reset
 };
 
 const bench_row bench_net_rows[] = {

@@ -118,7 +118,7 @@ static dar_status make(struct network *n, const dar_config *c, const size_t *byt
     dar_dit_init(&n->m, &n->p, &c->dit, &c->adapter);
     dar_lora_init(&n->m, &n->p, &c->lora);
     if (rank) dar_params_train(&n->p, DAR_PARAM_LORA | DAR_PARAM_ADAPTER);
-    n->m.keep = true;
+    n->m.replay = DAR_REPLAY_PRODUCTS;
     dar_params_fresh(&n->p, DAR_PARAM_ALL, 1);
     dar_params_gradients(&n->p);
     if (eight) dar_lora_quantise(&n->m, &n->p, 0, c->dit.layers, &n->arena[STEP]);

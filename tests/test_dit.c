@@ -159,16 +159,14 @@ static void matches_the_reference(void **state)
     } run[] = { { DAR_F64, 1e-10, 1e-9 }, { DAR_F32, 2e-5, 1e-4 } };
     (void)state;
     for (size_t i = 0; i < DAR_COUNT(run); i++)
-        for (int keep = 0; keep < 2; keep++) {
+        for (int replay = 0; replay < DAR_REPLAYS; replay++) {
             struct parity p;
             parity_init(&p, run[i].type, run[i].bound, run[i].grad_bound);
             stages(&p);
-            p.o.m.keep = keep;
+            p.o.m.replay = (dar_dit_replay)replay;
             gradients(&p);
-            p.o.m.whole = true;
-            gradients(&p);
-            printf("note: transformer against the reference, %s: stages %.1e, gradients %.1e\n",
-                   dar_dtype_name(run[i].type), p.worst, p.worst_grad);
+            printf("note: transformer against the reference, %s, replaying %s: stages %.1e, gradients %.1e\n",
+                   dar_dtype_name(run[i].type), dar_dit_replay_name[replay], p.worst, p.worst_grad);
             parity_free(&p);
         }
 }

@@ -201,6 +201,13 @@ static struct result run(const struct trial *t, const struct options *o)
     }
     CHECK(memcmp(gy.data, c.gy.data, dar_tensor_bytes(&gy)) == 0, "%s, sample %d: backward changed gy", op->name,
           t->index);
+    if (op->in_place && !o->add && c.gx[0].data && dar_shape_equal(&c.gx[0].shape, &c.gy.shape) &&
+        c.gx[0].dtype == c.gy.dtype) {
+        c.gx[0] = c.gy;
+        call(t, &c, true);
+        CHECK(memcmp(r.gx[0].data, c.gy.data, dar_tensor_bytes(&gy)) == 0, "%s, sample %d: in place it differs",
+              op->name, t->index);
+    }
     return r;
 }
 

@@ -332,7 +332,7 @@ static void lengths_of_the_paper(void **state)
         dar_params_gradients(&o.p);
         size_t weights = o.weights.used;
         model_clip(&o, (length[i] - 1) / 4 + 1, 15, 26, 30);
-        o.m.keep = true;
+        o.m.replay = DAR_REPLAY_PRODUCTS;
         dar_val *loss = model_loss(&o);
         dar_backward(&o.tape, loss, NULL);
         size_t training = o.step.peak, kept = o.keep.peak;

@@ -18,7 +18,8 @@ struct trainer {
 struct what {
     dar_dtype storage;
     unsigned train;
-    bool keep, plan;
+    dar_dit_replay replay;
+    bool plan;
 };
 
 /* dar-test, a little wider: no tile, no vector and no chunk fits these sizes. */
@@ -41,7 +42,7 @@ static void trainer_init(struct trainer *r, struct what w)
         if (q->info.law == DAR_FRESH_VALUE && q->info.spread == 0) dar_rng_fill_uniform(&q->x, 9, i, -0.3, 0.3);
     }
     model_clip(&r->o, 3, 3, 5, 7);
-    r->o.m.keep = w.keep;
+    r->o.m.replay = w.replay;
     CHECK(dar_arena_init(&r->moments, "moments", (size_t)16 << 20, &e) == DAR_OK, "%s", e.text);
 }
 
@@ -85,7 +86,7 @@ static double train(struct trainer *r)
 
 static double loss_of(struct trainer *r, dar_dtype storage)
 {
-    trainer_init(r, (struct what){ storage, DAR_PARAM_LORA | DAR_PARAM_ADAPTER, true, false });
+    trainer_init(r, (struct what){ storage, DAR_PARAM_LORA | DAR_PARAM_ADAPTER, DAR_REPLAY_PRODUCTS, false });
     return gradients(r);
 }
 
@@ -121,6 +122,29 @@ static void precisions_agree(void **state)
     trainer_free(&wide);
     trainer_free(&f32);
     trainer_free(&bf16);
+}
+
+/* ---------------------------------------------------------------- what is computed again */
+
+/* The same numbers again; but bf16 rounds the argument of an activation that is kept: its bound is that of a step. */
+static void replays_agree(void **state)
+{
+    (void)state;
+    for (int run = 0; run < 4; run++)
+        for (int replay = 1; replay < DAR_REPLAYS; replay++) {
+            struct what w = { run & 1 ? DAR_BF16 : DAR_F32, DAR_PARAM_ADAPTER, DAR_REPLAY_ALL, false };
+            struct trainer all, some;
+            w.train |= run & 2 ? DAR_PARAM_BASE : DAR_PARAM_LORA;
+            trainer_init(&all, w);
+            w.replay = (dar_dit_replay)replay;
+            trainer_init(&some, w);
+            gradients(&all);
+            gradients(&some);
+            bool rounds = w.storage == DAR_BF16 && replay == DAR_REPLAY_CHEAP;
+            CHECK_NEAR(dar_dit_replay_name[replay], distance(&some, &all), 0, rounds ? 1.5e-2 : 0);
+            trainer_free(&all);
+            trainer_free(&some);
+        }
 }
 
 /* ---------------------------------------------------------------- threads */
@@ -160,11 +184,11 @@ static void same_bits(struct what w)
 static void threads_give_the_same_bits(void **state)
 {
     (void)state;
-    same_bits((struct what){ DAR_F32, DAR_PARAM_LORA | DAR_PARAM_ADAPTER, true, false });
-    same_bits((struct what){ DAR_F32, DAR_PARAM_BASE | DAR_PARAM_ADAPTER, false, false });
-    same_bits((struct what){ DAR_BF16, DAR_PARAM_LORA | DAR_PARAM_ADAPTER, false, false });
-    same_bits((struct what){ DAR_BF16, DAR_PARAM_BASE | DAR_PARAM_ADAPTER, true, false });
-    same_bits((struct what){ DAR_F64, DAR_PARAM_LORA, false, false });
+    same_bits((struct what){ DAR_F32, DAR_PARAM_LORA | DAR_PARAM_ADAPTER, DAR_REPLAY_PRODUCTS, false });
+    same_bits((struct what){ DAR_F32, DAR_PARAM_BASE | DAR_PARAM_ADAPTER, DAR_REPLAY_ALL, false });
+    same_bits((struct what){ DAR_BF16, DAR_PARAM_LORA | DAR_PARAM_ADAPTER, DAR_REPLAY_CHEAP, false });
+    same_bits((struct what){ DAR_BF16, DAR_PARAM_BASE | DAR_PARAM_ADAPTER, DAR_REPLAY_PRODUCTS, false });
+    same_bits((struct what){ DAR_F64, DAR_PARAM_LORA, DAR_REPLAY_NOTHING, false });
 }
 
 /* ---------------------------------------------------------------- memory */
@@ -172,10 +196,10 @@ static void threads_give_the_same_bits(void **state)
 static void peak_is_as_planned(void **state)
 {
     (void)state;
-    for (int run = 0; run < 4; run++) {
+    for (int run = 0; run < 2 * DAR_REPLAYS; run++) {
         struct trainer plan, real;
-        struct what w = { DAR_BF16, DAR_PARAM_ADAPTER | DAR_PARAM_LORA, run & 1, true };
-        if (run & 2) w.train = DAR_PARAM_ADAPTER | DAR_PARAM_BASE;
+        struct what w = { DAR_BF16, DAR_PARAM_ADAPTER | DAR_PARAM_LORA, (dar_dit_replay)(run / 2), true };
+        if (run & 1) w.train = DAR_PARAM_ADAPTER | DAR_PARAM_BASE;
         trainer_init(&plan, w);
         w.plan = false;
         trainer_init(&real, w);
@@ -196,6 +220,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(precisions_agree),
+        cmocka_unit_test(replays_agree),
         cmocka_unit_test(threads_give_the_same_bits),
         cmocka_unit_test(peak_is_as_planned),
     };

@@ -58,7 +58,7 @@ static dar_val *block(dar_tape *t, void *arg, dar_val *const *in)
     dar_val *x = in[0];
     dar_val *y = dar_modulate(t, x, in[1], in[2], &(dar_norm_opt){ .eps = 1e-6, .split = 2 });
     dar_val *q = product(t, y, h->w[0]), *k = product(t, y, h->w[WK - WQ]), *v = product(t, y, h->w[WV - WQ]);
-    y = dar_attention(t, q, k, v, &(dar_attention_opt){ .heads = A, .keep = h->mode->kept });
+    y = dar_attention(t, q, k, v, &(dar_attention_opt){ .heads = A, .keep = h->mode->kept ? DAR_KEEP_ALL : 0 });
     x = dar_gate(t, x, product(t, y, h->w[WO - WQ]), in[3], 2);
     if (!h->mode->nested) return feed_forward(t, h, &x);
     return dar_segment(t, feed_forward, h, &x, 1, x->x.dtype, x->x.shape);

@@ -162,7 +162,7 @@ static void ways_agree(void **state)
     c.recompute = DAR_RECOMPUTE_NONE;
     start(&a, &c, LORA);
     double first = learn(&a);
-    for (int how = DAR_RECOMPUTE_MOST; how <= DAR_RECOMPUTE_ALL; how++) {
+    for (int how = DAR_RECOMPUTE_CHEAP; how <= DAR_RECOMPUTE_ALL; how++) {
         c.recompute = how;
         start(&b, &c, LORA);
         CHECK_NEAR("loss", learn(&b), first, 0);
@@ -170,15 +170,21 @@ static void ways_agree(void **state)
         stop(&b);
     }
     const dar_step_plan *p = a.plan;
-    size_t none = p[1].bytes[0] + p[1].bytes[1], most = p[2].bytes[0] + p[2].bytes[1],
-           all = p[3].bytes[0] + p[3].bytes[1];
-    CHECK(all < most && most < none, "bytes: none %zu, selective %zu, full %zu", none, most, all);
-    CHECK(p[1].forward < p[2].forward && p[2].forward < p[3].forward, "work of recomputing: %g, %g, %g", p[1].forward,
-          p[2].forward, p[3].forward);
+    size_t bytes[DAR_RECOMPUTE_ALL + 1];
+    for (int how = DAR_RECOMPUTE_NONE; how <= DAR_RECOMPUTE_ALL; how++) {
+        bytes[how] = p[how].bytes[0] + p[how].bytes[1];
+        printf("note: %s: %zu bytes, %g FLOP\n", dar_recompute_name[how], bytes[how], p[how].forward);
+        if (how == DAR_RECOMPUTE_NONE) continue;
+        CHECK(bytes[how] < bytes[how - 1], "%s: %zu bytes, %zu before", dar_recompute_name[how], bytes[how],
+              bytes[how - 1]);
+        bool more = p[how].forward > p[how - 1].forward;
+        CHECK(more == (how > DAR_RECOMPUTE_CHEAP), "%s: %g FLOP, %g before", dar_recompute_name[how], p[how].forward,
+              p[how - 1].forward);
+    }
     a.c.recompute = DAR_RECOMPUTE_AUTO;
-    assert_int_equal(dar_step_choose(&a.c, p, none), DAR_RECOMPUTE_NONE);
-    assert_int_equal(dar_step_choose(&a.c, p, none - 1), DAR_RECOMPUTE_MOST);
-    assert_int_equal(dar_step_choose(&a.c, p, most - 1), DAR_RECOMPUTE_ALL);
+    assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_NONE]), DAR_RECOMPUTE_CHEAP);
+    assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_CHEAP] - 1), DAR_RECOMPUTE_MOST);
+    assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_MOST] - 1), DAR_RECOMPUTE_ALL);
     assert_int_equal(dar_step_choose(&a.c, p, 0), DAR_RECOMPUTE_ALL);
     stop(&a);
 }

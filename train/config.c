@@ -10,7 +10,7 @@
 #define DEPTH  8                            /* files that are each other's base */
 #define NEEDED NULL
 
-const char *const dar_recompute_name[] = { "auto", "none", "selective", "full", NULL };
+const char *const dar_recompute_name[] = { "auto", "none", "cheap", "selective", "full", NULL };
 
 static const char *const what_names[] = { "lora", "full", "vae", NULL };
 static const char *const storage_names[] = { "f64", "f32", "bf16", NULL }; /* dar_dtype */

@@ -22,8 +22,8 @@
  *   target_modules               list of names    all ten  of models/config.h, lora.targets
  *   mixed_precision              f64 | f32 | bf16  bf16    of products' operands and frozen weights; sums, trained
  *                                                          weights and what is listed in models/dit.h are f32 or wider
- *   gradient_checkpointing       auto | none | selective | full   auto   keep everything; blocks are run again in
- *                                                          backward, but their attention; they are run again
+ *   gradient_checkpointing       auto | none | cheap | selective | full   auto   keep everything; in backward compute
+ *                                                          again what costs little; blocks but their attention; blocks
  *   memory_budget                >= 0 [GB]        0        of which auto takes the fastest that fits; 0: the machine's
  *
  *   learning_rate                >= 0             1e-4
@@ -75,6 +75,7 @@ typedef enum dar_train_what { DAR_TRAIN_LORA, DAR_TRAIN_FULL, DAR_TRAIN_VAE } da
 typedef enum dar_recompute {
     DAR_RECOMPUTE_AUTO,
     DAR_RECOMPUTE_NONE,
+    DAR_RECOMPUTE_CHEAP,
     DAR_RECOMPUTE_MOST,
     DAR_RECOMPUTE_ALL
 } dar_recompute;

@@ -174,10 +174,15 @@ dar_step_report dar_step_look(dar_step *s, const dar_batch *b, int64_t step)
 
 static void set_way(dar_step *s, dar_recompute how)
 {
+    static const dar_dit_replay replay[] = {
+        [DAR_RECOMPUTE_NONE] = DAR_REPLAY_NOTHING,
+        [DAR_RECOMPUTE_CHEAP] = DAR_REPLAY_CHEAP,
+        [DAR_RECOMPUTE_MOST] = DAR_REPLAY_PRODUCTS,
+        [DAR_RECOMPUTE_ALL] = DAR_REPLAY_ALL,
+    };
     s->how = how;
-    s->m->whole = how == DAR_RECOMPUTE_NONE;
-    s->m->keep = how == DAR_RECOMPUTE_MOST;
-    s->tape.keep = s->m->keep ? &s->keep : NULL;
+    s->m->replay = replay[how];
+    s->tape.keep = &s->keep;
 }
 
 /* A batch without memory behind it. */
@@ -232,7 +237,7 @@ dar_recompute dar_step_choose(const dar_train_config *c, const dar_step_plan pla
     for (int k = DAR_RECOMPUTE_NONE + 1; k <= DAR_RECOMPUTE_ALL; k++) {
         double work = plan[k].forward + plan[k].backward, least = plan[best].forward + plan[best].backward;
         bool fits = bytes_of(&plan[k]) <= bytes, best_fits = bytes_of(&plan[best]) <= bytes;
-        if (best_fits ? fits && work < least : bytes_of(&plan[k]) < bytes_of(&plan[best])) best = k;
+        if (best_fits ? fits && work <= least : bytes_of(&plan[k]) < bytes_of(&plan[best])) best = k;
     }
     return (dar_recompute)best;
 }

@@ -47,7 +47,8 @@ typedef struct dar_step {
 dar_status dar_step_count(dar_step_plan plan[DAR_RECOMPUTE_ALL + 1], const dar_train_config *c, dar_dit *m,
                           const dar_step_size *size, dar_err *e);
 
-/* The way that the configuration asks for; auto: the one with least work that fits in `bytes`, else the smallest. */
+/* The way that the configuration asks for; auto: the one with least work that fits in `bytes`, and if two have the
+ * same, the one with less memory; else the smallest. */
 dar_recompute dar_step_choose(const dar_train_config *c, const dar_step_plan plan[DAR_RECOMPUTE_ALL + 1], size_t bytes);
 
 /* Reserve memory for it.  c and m must outlive *s.  On failure *s is freed. */

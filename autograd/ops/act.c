@@ -74,6 +74,7 @@ static void backward(const dar_opctx *c, dar_kern_map_back *back)
     const dar_op dar_op_##NAME = {                                                                                     \
         .name = #NAME,                                                                                                 \
         .n_in = 1,                                                                                                     \
+        .in_place = true,                                                                                              \
         .keep = DAR_KEEP_X(0),                                                                                         \
         .shape = same_shape,                                                                                           \
         .forward = NAME##_forward,                                                                                     \

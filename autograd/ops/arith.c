@@ -36,7 +36,8 @@ static dar_bcast gradient(const dar_opctx *c, int i, dar_bcast_fn *fn, const dar
 static void give(const dar_opctx *c, int i, dar_bcast_fn *fn, const dar_tensor *other)
 {
     dar_bcast g = gradient(c, i, fn, other);
-    if (!c->gx[i].data) return; /* frozen */
+    if (!c->gx[i].data) return;              /* frozen */
+    if (c->gx[i].data == c->gy.data) return; /* in place: a sum hands gy on */
     if (dar_shape_equal(&c->gy.shape, &c->gx[i].shape)) dar_bcast_map(&g);
     else dar_bcast_sum(&g);
 }
@@ -131,6 +132,7 @@ static void add_backward(const dar_opctx *c)
 const dar_op dar_op_add = {
     .name = "add",
     .n_in = 2,
+    .in_place = true,
     .shape = sum_shape,
     .scratch = sum_scratch,
     .terms = terms,
@@ -161,6 +163,7 @@ static void sub_backward(const dar_opctx *c)
 const dar_op dar_op_sub = {
     .name = "sub",
     .n_in = 2,
+    .in_place = true,
     .shape = sum_shape,
     .scratch = sum_scratch,
     .terms = terms,

@@ -184,5 +184,5 @@ dar_val *dar_attention(dar_tape *t, dar_val *q, dar_val *k, dar_val *v, const da
 {
     dar_val *in[] = { q, k, v, o->log_weight };
     struct attr at = { o->heads, o->scale };
-    return (o->keep ? dar_apply_kept : dar_apply)(t, &dar_op_attention, in, DAR_COUNT(in), &at);
+    return dar_apply_kept(t, &dar_op_attention, in, DAR_COUNT(in), &at, o->keep);
 }

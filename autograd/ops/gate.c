@@ -90,7 +90,7 @@ static void backward_piece(const struct walk *w, size_t row, size_t j, size_t gr
     double gbuf[DAR_PIECE], ubuf[DAR_PIECE];
     const void *g = dar_row_get(w->type, gy->dtype, dar_tensor_at(gy, i), n, gbuf);
 
-    if (gx->data) dar_row_put(w->type, g, gx->dtype, dar_tensor_at(gx, i), n, w->mode[0]);
+    if (gx->data && gx->data != gy->data) dar_row_put(w->type, g, gx->dtype, dar_tensor_at(gx, i), n, w->mode[0]);
     if (part) {
         void *sum = part + j * dar_dtype_size(w->type);
         w->k->mul_add(n, dar_row_get(w->type, u->dtype, dar_tensor_at(u, i), n, ubuf), g, sum, sum);
@@ -180,6 +180,7 @@ static const dar_error_sample gate_errors[] = {
 const dar_op dar_op_gate = {
     .name = "gate",
     .n_in = 3,
+    .in_place = true,
     .keep = DAR_KEEP_X(U) | DAR_KEEP_X(G),
     .attr_size = sizeof(dar_gate_attr),
     .shape = gate_shape,

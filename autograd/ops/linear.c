@@ -507,7 +507,7 @@ dar_val *dar_linear(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, const dar_l
 {
     struct attr at = { .scale = 1 };
     if (o) at.o = *o;
-    return dar_apply(t, &dar_op_linear, (dar_val *[]){ x, w, b }, 3, &at);
+    return dar_apply_kept(t, &dar_op_linear, (dar_val *[]){ x, w, b }, 3, &at, at.o.keep);
 }
 
 dar_val *dar_lora(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, dar_val *a, dar_val *u, double scale,
@@ -515,5 +515,5 @@ dar_val *dar_lora(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, dar_val *a, d
 {
     struct attr at = { .scale = scale };
     if (o) at.o = *o;
-    return dar_apply(t, &dar_op_lora, (dar_val *[]){ x, w, a, u, b }, 5, &at);
+    return dar_apply_kept(t, &dar_op_lora, (dar_val *[]){ x, w, a, u, b }, 5, &at, at.o.keep);
 }

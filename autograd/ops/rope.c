@@ -145,6 +145,7 @@ static const dar_error_sample rope_errors[] = {
 const dar_op dar_op_rope = {
     .name = "rope",
     .n_in = 2,
+    .in_place = true,
     .keep = DAR_KEEP_X(TABLE),
     .frozen = DAR_KEEP_X(TABLE),
     .shape = rope_shape,
