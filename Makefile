@@ -50,7 +50,8 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
-.PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit ulp fuzz fuzz-run
+.PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit bench-vae bench-weights
+.PHONY: ulp fuzz fuzz-run
 .PHONY: deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -126,7 +127,7 @@ bench-kernels: deps ## speed of every kernel as a fraction of the machine's peak
 		$B/bench_kernels --output=build/bench/kernels.csv \
 		$(if $(QUICK),--quick) $(if $(FILTER),'--filter=$(FILTER)') $(if $(CPU),--cpu-mask=$(CPU))
 
-$B/speed_%: $B/tests/speed_%.o $B/tests/bench_peak.o $B/libdar.a
+$B/speed_%: $B/tests/speed_%.o $B/tests/rate.o $B/tests/bench_peak.o $B/libdar.a
 	@echo "LD $@"
 	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
 
@@ -135,9 +136,17 @@ bench: deps ## speed of whole tasks, stage by stage: build/bench/data.csv
 	@mkdir -p build/bench
 	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_data --output=build/bench/data.csv
 
-bench-dit: deps ## the 5B network with random weights: one evaluation; 13 GB, minutes; ARGS="--layers 4 --rank 16"
+bench-dit bench-vae: bench-%: deps
+	@$(MAKE) --no-print-directory $B/speed_$*
+	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_$* $(ARGS)
+bench-dit: ## the 5B network with random weights: one evaluation; 13 GB, minutes; ARGS="--layers 4 --rank 16"
+bench-vae: ## its autoencoder: 9 frames encoded and decoded; 4 GB, minutes; ARGS="--frames 1"
+
+WEIGHTS := build/bench/wan22-fun-5b.safetensors
+bench-weights: ## a file of random weights of the 5B network, 10.6 GB; bench-dit ARGS="--weights FILE" loads it
 	@$(MAKE) --no-print-directory $B/speed_dit
-	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_dit $(ARGS)
+	@mkdir -p $(dir $(WEIGHTS))
+	@$B/speed_dit --write $(WEIGHTS)
 
 everything: all $(TESTS:%=$B/%) $B/bench_kernels $(SPEED:%=$B/%) $B/ulp
 

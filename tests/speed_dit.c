@@ -1,19 +1,23 @@
 /* speed_dit.c: the public model with random bf16 weights of its real shapes: one evaluation, or with --rank a training
  * step, at the size and depth asked for: seconds, rate against the machine's peak, memory as planned and as taken. */
+#include <fcntl.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/resource.h>
-#include <time.h>
+#include <unistd.h>
 
 #include "lib/program.h"
 #include "lib/rng.h"
 #include "lib/thread.h"
 #include "models/dit.h"
+#include "lib/safetensors_write.h"
+#include "lib/weights.h"
+#include "models/load.h"
 #include "models/lora.h"
-#include "tests/bench.h"
+#include "tests/rate.h"
 
 static int64_t layers, frames, size[2], rank, words;
 static const char *preset;
+static const char *file, *written;
 static bool eight;
 static dar_common common;
 
@@ -64,6 +68,16 @@ static const dar_option options[] = {
       .lo = 0,
       .hi = 4096,
       .help = "a training step of LoRA of this rank; 0: an evaluation" },
+    { .name = "weights",
+      .placeholder = "FILE",
+      .type = DAR_ARG_TEXT,
+      .target = &file,
+      .help = "of the network; read, and timed, instead of made" },
+    { .name = "write",
+      .placeholder = "FILE",
+      .type = DAR_ARG_TEXT,
+      .target = &written,
+      .help = "write the weights that are made, and stop" },
     { .name = "eight", .type = DAR_ARG_FLAG, .target = &eight, .help = "products of blocks in 8 bits by 8 bits" },
 };
 
@@ -81,6 +95,7 @@ struct network {
     dar_tensor z, text;
     dar_dit_scene scene;
     dar_dit_text words;
+    dar_weights *file;
 };
 
 static dar_tensor clip_tensor(struct network *n, dar_dtype type, dar_shape s)
@@ -103,6 +118,55 @@ static void make_clip(struct network *n, const dar_config *c)
     n->text = clip_tensor(n, DAR_BF16, DAR_SHAPE(1, words, d->text_width));
 }
 
+/* ---------------------------------------------------------------- files */
+
+/* Every page once, in the order in which they lie in the file. */
+static double touch(const dar_params *p)
+{
+    double sum = 0;
+    for (size_t i = 0; i < p->count; i++) {
+        const dar_tensor *x = &p->at[i]->x;
+        for (size_t k = 0; x->data && k < dar_tensor_bytes(x); k += 4096) sum += ((const char *)x->data)[k];
+    }
+    return sum;
+}
+
+static dar_status load(struct network *n, dar_err *e)
+{
+    DAR_TRY(dar_weights_open(&n->file, file, e));
+    return dar_load_dit(&n->m, &n->p, n->file, 1, e);
+}
+
+/* Ask the system to forget what it holds of the file. */
+static int open_cold(void)
+{
+    int fd = open(file, O_RDONLY | O_CLOEXEC);
+    if (fd >= 0) posix_fadvise(fd, 0, 0, POSIX_FADV_DONTNEED);
+    return fd;
+}
+
+/* Seconds to read the whole file, from the disk. */
+static double read_through(void)
+{
+    static char buffer[1 << 20];
+    double start = rate_seconds();
+    int fd = open_cold();
+    while (fd >= 0 && read(fd, buffer, sizeof buffer) > 0) {
+    }
+    if (fd >= 0) close(fd);
+    return rate_seconds() - start;
+}
+
+static dar_status write_weights(const struct network *n, dar_err *e)
+{
+    dar_safetensors_item *item = calloc(n->p.count, sizeof *item);
+    DAR_ASSERT(item, "no memory for %zu names", n->p.count);
+    for (size_t i = 0; i < n->p.count; i++) item[i] = (dar_safetensors_item){ n->p.at[i]->name, n->p.at[i]->x };
+    dar_status s = dar_safetensors_write(written, item, n->p.count, NULL, e);
+    free(item);
+    return s;
+}
+
 /* bytes NULL: only plan. */
 static dar_status make(struct network *n, const dar_config *c, const size_t *bytes, dar_err *e)
 {
@@ -119,6 +183,7 @@ static dar_status make(struct network *n, const dar_config *c, const size_t *byt
     dar_lora_init(&n->m, &n->p, &c->lora);
     if (rank) dar_params_train(&n->p, DAR_PARAM_LORA | DAR_PARAM_ADAPTER);
     n->m.replay = DAR_REPLAY_PRODUCTS;
+    if (bytes && file) DAR_TRY(load(n, e));
     dar_params_fresh(&n->p, DAR_PARAM_ALL, 1);
     dar_params_gradients(&n->p);
     if (eight) dar_lora_quantise(&n->m, &n->p, 0, c->dit.layers, &n->arena[STEP]);
@@ -134,6 +199,7 @@ static void drop(struct network *n)
     dar_tape_free(&n->scene_tape);
     dar_tape_free(&n->tape);
     for (int i = 0; i < ARENAS; i++) dar_arena_free(&n->arena[i]);
+    dar_weights_close(n->file);
 }
 
 /* ---------------------------------------------------------------- what is measured */
@@ -158,43 +224,34 @@ static void train(struct network *n)
     dar_backward(&n->tape, loss, NULL);
 }
 
-static double seconds(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-}
-
 static double flops(const dar_tape *t)
 {
     return t->cost.forward + t->cost.backward;
 }
 
-static int by_size(const void *a, const void *b)
+static dar_status make_timed(const dar_run *r, struct network *n, const dar_config *c, const size_t *bytes, dar_err *e)
 {
-    double x = *(const double *)a, y = *(const double *)b;
-    return (x > y) - (x < y);
+    if (!file) return make(n, c, bytes, e);
+    dar_run_say(r, "read     %8.2f s  %s, from the disk", read_through(), file);
+    close(open_cold());
+    double start = rate_seconds();
+    DAR_TRY(make(n, c, bytes, e));
+    double sum = touch(&n->p);
+    dar_run_say(r, "load     %8.2f s  the same, every page touched (%g)", rate_seconds() - start, sum);
+    return DAR_OK;
 }
 
-static double peak(void)
+static double plan(const dar_run *r, struct network *n, const dar_config *c, size_t bytes[ARENAS])
 {
-    double sample[15];
-    for (size_t i = 0; i < DAR_COUNT(sample); i++) sample[i] = bench_peak_sample(BENCH_BF16);
-    qsort(sample, DAR_COUNT(sample), sizeof *sample, by_size);
-    return sample[DAR_COUNT(sample) / 2] * 1e9;
-}
-
-static double taken(void)
-{
-    struct rusage u;
-    getrusage(RUSAGE_SELF, &u);
-    return 1024.0 * (double)u.ru_maxrss;
-}
-
-static void say_rate(const dar_run *r, const char *what, double s, double work, double most)
-{
-    dar_run_say(r, "%-8s %8.2f s  %7.2f TFLOP  %6.1f GF/s, %.2f of the peak", what, s, work * 1e-12, work / s * 1e-9,
-                work / s / most);
+    if (rank) {
+        train(n);
+    } else {
+        prepare(n, &n->scene_tape);
+        evaluate(n);
+    }
+    dar_run_say(r, "%s, %lld blocks, %lld tokens, %d threads", c->name, (long long)c->dit.layers,
+                (long long)(n->clip.frames * n->scene.frame), dar_threads());
+    return rate_planned(r, n->arena, ARENAS, bytes);
 }
 
 static dar_status measure(dar_run *r, dar_err *e)
@@ -202,44 +259,36 @@ static dar_status measure(dar_run *r, dar_err *e)
     struct network n;
     dar_config c;
     size_t bytes[ARENAS];
-    double planned = 0;
 
     DAR_TRY(dar_config_open(&c, preset, e));
     if (layers) c.dit.layers = layers;
-    c.adapter.geometry = 9;
+    if (c.adapter.geometry == 0) c.adapter.geometry = 9;
     c.lora = (dar_lora_config){ .rank = rank, .alpha = (double)rank, .targets = DAR_PROJECTIONS_ALL };
     DAR_TRY(make(&n, &c, NULL, e));
-    if (rank) {
-        train(&n);
-    } else {
-        prepare(&n, &n.scene_tape);
-        evaluate(&n);
-    }
-    dar_run_say(r, "%s, %lld blocks, %lld tokens, %d threads", c.name, (long long)c.dit.layers,
-                (long long)(n.clip.frames * n.scene.frame), dar_threads());
-    for (int i = 0; i < ARENAS; i++) {
-        bytes[i] = n.arena[i].peak;
-        planned += (double)bytes[i];
-        dar_run_say(r, "%-8s %8.3f GB", arena_names[i], (double)bytes[i] * 1e-9);
-    }
+    double planned = plan(r, &n, &c, bytes);
     drop(&n);
     if (common.dry_run) return DAR_OK;
 
-    double before = taken();
-    DAR_TRY(make(&n, &c, bytes, e));
-    double most = peak(), start = seconds();
+    double before = rate_taken();
+    DAR_TRY(make_timed(r, &n, &c, bytes, e));
+    if (written) {
+        dar_status s = write_weights(&n, e);
+        drop(&n);
+        return s;
+    }
+    double most = rate_peak(), start = rate_seconds();
     if (rank) {
         train(&n);
-        say_rate(r, "step", seconds() - start, flops(&n.tape), most);
+        rate_say(r, "step", rate_seconds() - start, flops(&n.tape), most);
     } else {
         prepare(&n, &n.scene_tape);
-        say_rate(r, "scene", seconds() - start, flops(&n.scene_tape), most);
-        start = seconds();
+        rate_say(r, "scene", rate_seconds() - start, flops(&n.scene_tape), most);
+        start = rate_seconds();
         evaluate(&n);
-        say_rate(r, "step", seconds() - start, flops(&n.tape), most);
+        rate_say(r, "step", rate_seconds() - start, flops(&n.tape), most);
     }
     dar_run_say(r, "peak     %8.1f GF/s of bf16", most * 1e-9);
-    dar_run_say(r, "memory   %8.3f GB planned, %.3f GB taken", planned * 1e-9, (taken() - before) * 1e-9);
+    dar_run_say(r, "memory   %8.3f GB planned, %.3f GB taken", planned * 1e-9, (rate_taken() - before) * 1e-9);
     drop(&n);
     return DAR_OK;
 }
