@@ -27,7 +27,9 @@ static const char *skip_prefixes(const char *s)
                                           "pipe.dit.",   "transformer.", "base_model.model." };
     for (size_t i = 0; i < DAR_COUNT(prefix); i++) {
         size_t n = strlen(prefix[i]);
-        if (!strncmp(s, prefix[i], n)) return skip_prefixes(s + n);
+        if (strncmp(s, prefix[i], n) != 0) continue;
+        s += n;
+        i = (size_t)-1; /* from the first again */
     }
     return s;
 }
@@ -86,7 +88,7 @@ void dar_lora_module(char *name, size_t size, int64_t block, dar_projection whic
 
 /* What a file says about one product. */
 struct found {
-    const char *name[3]; /* by part; NULL: nothing */
+    const dar_weight *part[3]; /* NULL: nothing */
 };
 
 static dar_status collect(struct found *found, int64_t layers, dar_weights *f, dar_err *e)
@@ -98,17 +100,17 @@ static dar_status collect(struct found *found, int64_t layers, dar_weights *f, d
             return dar_fail(e, DAR_ERR_FORMAT,
                             "%s: %s: expected the low-rank addition of a product of blocks 0 to %lld", x->file, x->name,
                             (long long)layers - 1);
-        const char **name = &found[k.block * DAR_PROJECTIONS + k.projection].name[k.part];
-        if (*name) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s and %s mean the same", x->file, *name, x->name);
-        *name = x->name;
+        const dar_weight **part = &found[k.block * DAR_PROJECTIONS + k.projection].part[k.part];
+        if (*part) return dar_fail(e, DAR_ERR_FORMAT, "%s: %s and %s mean the same", x->file, (*part)->name, x->name);
+        *part = x;
     }
     return DAR_OK;
 }
 
-static dar_status wrong_shape(const char *name, const dar_tensor *x, dar_shape want, dar_err *e)
+static dar_status wrong_shape(const dar_weight *w, const dar_tensor *x, dar_shape want, dar_err *e)
 {
     char found[96], expected[96];
-    return dar_fail(e, DAR_ERR_FORMAT, "%s: found %s, expected %s", name,
+    return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found %s, expected %s", w->file, w->name,
                     dar_shape_text(&x->shape, found, sizeof found), dar_shape_text(&want, expected, sizeof expected));
 }
 
@@ -119,27 +121,26 @@ static dar_status read_product(dar_dit *m, dar_params *p, int64_t index, const s
     dar_projection which = (dar_projection)(index % DAR_PROJECTIONS);
     dar_dit_product *q = &m->block[block].product[which];
     const int64_t *d = q->w->x.shape.d; /* out, in */
-    const char *const *name = in->name;
+    const dar_weight *const *w = in->part, *any = w[0] ? w[0] : w[1] ? w[1] : w[2];
     dar_tensor down, up, alpha;
 
-    if (!name[DAR_LORA_DOWN] || !name[DAR_LORA_UP])
-        return dar_fail(e, DAR_ERR_FORMAT, "%s: found %s alone, expected both factors", dar_weights_at(f, 0)->file,
-                        name[0]   ? name[0]
-                        : name[1] ? name[1]
-                                  : name[2]);
-    DAR_TRY(dar_weights_tensor(f, name[DAR_LORA_DOWN], &down, e));
-    DAR_TRY(dar_weights_tensor(f, name[DAR_LORA_UP], &up, e));
+    if (!w[DAR_LORA_DOWN] || !w[DAR_LORA_UP])
+        return dar_fail(e, DAR_ERR_FORMAT, "%s: found %s alone, expected both factors", any->file, any->name);
+    DAR_TRY(dar_weights_tensor(f, w[DAR_LORA_DOWN]->name, &down, e));
+    DAR_TRY(dar_weights_tensor(f, w[DAR_LORA_UP]->name, &up, e));
     int64_t rank = q->down ? q->down->x.shape.d[0] : down.shape.d[0];
     dar_shape want[] = { DAR_SHAPE(rank, d[1]), DAR_SHAPE(d[0], rank) };
-    if (!dar_shape_equal(&down.shape, &want[0])) return wrong_shape(name[DAR_LORA_DOWN], &down, want[0], e);
-    if (!dar_shape_equal(&up.shape, &want[1])) return wrong_shape(name[DAR_LORA_UP], &up, want[1], e);
+    if (!dar_shape_equal(&down.shape, &want[0])) return wrong_shape(w[DAR_LORA_DOWN], &down, want[0], e);
+    if (!dar_shape_equal(&up.shape, &want[1])) return wrong_shape(w[DAR_LORA_UP], &up, want[1], e);
 
     double a = o->alpha > 0 ? o->alpha : (double)rank;
-    if (name[DAR_LORA_ALPHA]) {
-        DAR_TRY(dar_weights_tensor(f, name[DAR_LORA_ALPHA], &alpha, e));
-        if (dar_tensor_count(&alpha) != 1) return wrong_shape(name[DAR_LORA_ALPHA], &alpha, (dar_shape){ 0 }, e);
+    if (w[DAR_LORA_ALPHA]) {
+        DAR_TRY(dar_weights_tensor(f, w[DAR_LORA_ALPHA]->name, &alpha, e));
+        if (dar_tensor_count(&alpha) != 1) return wrong_shape(w[DAR_LORA_ALPHA], &alpha, (dar_shape){ 0 }, e);
         a = dar_dtype_get(alpha.dtype, alpha.data, 0);
-        if (!isfinite(a)) return dar_fail(e, DAR_ERR_FORMAT, "%s: found %g", name[DAR_LORA_ALPHA], a);
+        if (!isfinite(a))
+            return dar_fail(e, DAR_ERR_FORMAT, "%s: %s: found %g, expected a number", any->file,
+                            w[DAR_LORA_ALPHA]->name, a);
     }
     if (!q->down) dar_lora_declare(m, p, block, which, rank);
     q->scale = o->strength * a / (double)rank;
@@ -155,7 +156,7 @@ dar_status dar_lora_read(dar_dit *m, dar_params *p, dar_weights *f, const dar_lo
     dar_status s = found ? collect(found, m->c.layers, f, e) : dar_fail(e, DAR_ERR_NOMEM, "lora: out of memory");
 
     for (int64_t i = 0; s == DAR_OK && i < n; i++)
-        if (found[i].name[0] || found[i].name[1] || found[i].name[2]) s = read_product(m, p, i, &found[i], f, o, e);
+        if (found[i].part[0] || found[i].part[1] || found[i].part[2]) s = read_product(m, p, i, &found[i], f, o, e);
     free(found);
     return s;
 }

@@ -12,6 +12,7 @@ int fuzz_exr(const uint8_t *data, size_t size);
 int fuzz_gltf(const uint8_t *data, size_t size);
 int fuzz_image(const uint8_t *data, size_t size);
 int fuzz_json(const uint8_t *data, size_t size);
+int fuzz_lora(const uint8_t *data, size_t size);
 int fuzz_obj(const uint8_t *data, size_t size);
 int fuzz_safetensors(const uint8_t *data, size_t size);
 int fuzz_torch_file(const uint8_t *data, size_t size);
@@ -75,6 +76,12 @@ static void json(void **state)
     replay("tests/corpus/json", fuzz_json);
 }
 
+static void lora(void **state)
+{
+    (void)state;
+    replay("tests/corpus/lora", fuzz_lora);
+}
+
 static void obj(void **state)
 {
     (void)state;
@@ -95,10 +102,10 @@ static void torch_file(void **state)
 
 int main(void)
 {
-    const struct CMUnitTest tests[] = { cmocka_unit_test(bundle),    cmocka_unit_test(camera),
-                                        cmocka_unit_test(exr),       cmocka_unit_test(gltf),
-                                        cmocka_unit_test(image),     cmocka_unit_test(json),
-                                        cmocka_unit_test(obj),       cmocka_unit_test(safetensors),
-                                        cmocka_unit_test(torch_file) };
+    const struct CMUnitTest tests[] = { cmocka_unit_test(bundle),      cmocka_unit_test(camera),
+                                        cmocka_unit_test(exr),         cmocka_unit_test(gltf),
+                                        cmocka_unit_test(image),       cmocka_unit_test(json),
+                                        cmocka_unit_test(lora),        cmocka_unit_test(obj),
+                                        cmocka_unit_test(safetensors), cmocka_unit_test(torch_file) };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
