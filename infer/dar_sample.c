@@ -8,6 +8,7 @@
 #include "data/pictures.h"
 #include "infer/output.h"
 #include "infer/pipeline.h"
+#include "infer/preview.h"
 #include "lib/log.h"
 #include "lib/program.h"
 #include "lib/sha256.h"
@@ -22,11 +23,12 @@ static struct {
     int solver, grid, precision, skip;
     int64_t window, overlap;
     dar_arg_list references, no_skip;
-    bool no_png, no_mp4, no_sheet, exr, mkv, overwrite;
+    bool random, preview, eval, latent, no_png, no_mp4, no_sheet, exr, mkv, overwrite;
     dar_common common;
 } o = { .overlap = -1 };
 
-static const char *const precision_names[] = { "f64", "f32", "bf16", NULL }; /* dar_dtype */
+static const char *const precision_names[] = { "f64", "f32", "bf16", "int8", NULL }; /* dar_dtype, but for the last */
+#define EIGHT 3
 static const char *const skip_names[] = { "none", "exact", NULL };
 static const char *const grid_names[] = { "even", "twice", "whole", "diffusers", "auto", NULL }; /* dar_flow_grid */
 
@@ -51,6 +53,8 @@ static const dar_option options[] = {
       .help = "autoencoder: safetensors or .pth" },
     { .name = "adapter", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_ADAPTER],
       .help = "control adapter, instead of the transformer's own" },
+    { .name = "taew", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_TAEW],
+      .help = "tiny decoder, for --preview: safetensors or .pth" },
     { .name = "lora", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_LORA],
       .help = "low-rank additions" },
     { .name = "lora-strength", .placeholder = "S", .type = DAR_ARG_NUMBER, .target = &o.strength, .standard = "1",
@@ -58,7 +62,10 @@ static const dar_option options[] = {
     { .name = "channels", .placeholder = "SET", .type = DAR_ARG_TEXT, .target = &o.channels,
       .help = "what the adapter is given, as dar or world+normal (default: what the model says)" },
     { .name = "precision", .placeholder = "TYPE", .type = DAR_ARG_CHOICE, .target = &o.precision, .standard = "bf16",
-      .names = precision_names, .help = "f64, f32 or bf16 (sums are f32)" },
+      .names = precision_names, .help = "f64, f32, bf16 (sums are f32), or int8: as bf16, products of the "
+      "middle blocks of 8 bits" },
+    { .name = "random", .type = DAR_ARG_FLAG, .target = &o.random,
+      .help = "weights that have no file are drawn by --seed: to try speed and memory" },
 
     { .help = "Sampling" },
     { .name = "steps", .placeholder = "N", .type = DAR_ARG_INT, .target = &o.steps, .standard = "50",
@@ -94,6 +101,12 @@ static const dar_option options[] = {
     { .name = "no-sheet", .type = DAR_ARG_FLAG, .target = &o.no_sheet, .help = "no contact sheet" },
     { .name = "exr", .type = DAR_ARG_FLAG, .target = &o.exr,
       .help = "exr/00000.exr ...: with depth, matte and ids of the bundle, for compositing" },
+    { .name = "eval", .type = DAR_ARG_FLAG, .target = &o.eval,
+      .help = "metrics.json: how far the frames are from the bundle's own (data/metric.h)" },
+    { .name = "latent", .type = DAR_ARG_FLAG, .target = &o.latent,
+      .help = "latent.safetensors: what the solver arrived at" },
+    { .name = "preview", .type = DAR_ARG_FLAG, .target = &o.preview,
+      .help = "while a video is sampled, OUT.preview.png shows what becomes of it" },
     { .name = "mkv", .type = DAR_ARG_FLAG, .target = &o.mkv, .help = "video.mkv, exact" },
 };
 /* clang-format on */
@@ -171,12 +184,20 @@ static dar_status read_condition(struct job *j, const dar_model_file *f, dar_err
     return dar_model_file_check(f, &feed, e);
 }
 
+static dar_dtype storage(void)
+{
+    return o.precision == EIGHT ? DAR_BF16 : (dar_dtype)o.precision;
+}
+
 static dar_status open_model(struct job *j, dar_err *e)
 {
     dar_model_options m = { .weights = o.weights, .strength = o.strength, .plan = o.common.dry_run };
     dar_model_file f;
     memcpy(m.part, o.part, sizeof m.part);
-    m.storage = (dar_dtype)o.precision;
+    m.storage = storage();
+    m.eight = o.precision == EIGHT;
+    m.random = o.random, m.seed = o.common.seed;
+    m.preview = o.preview;
     m.apart = !(j->how.sampler.skip >> DAR_SKIP_LORA & 1);
     dar_status s = dar_model_file_open(&f, o.model, e);
     if (s == DAR_OK) s = read_condition(j, &f, e);
@@ -290,7 +311,8 @@ static void print_model(dar_json_writer *w, const dar_model *m, const dar_condit
     for (size_t i = 0, n = 0; i < c->set.families; i++)
         n += (size_t)snprintf(set + n, sizeof set - n, "%s%s", i ? "+" : "", dar_family_table[c->set.family[i]].name);
     dar_json_write_text(w, "model", m->c.name);
-    for (int i = 0; i < DAR_MODEL_PARTS; i++)
+    if (o.random) dar_json_write_text(w, "weights", "random where there is no file");
+    for (int i = 0; i < DAR_MODEL_TAEW; i++)
         if (*m->path[i]) print_file(w, dar_model_part_name[i], m->path[i]);
     if (*m->path[DAR_MODEL_LORA]) dar_json_write_number(w, "lora_strength", o.strength);
     dar_json_write_text(w, "channels", set);
@@ -315,6 +337,8 @@ static dar_status print_settings(dar_json_writer *w, const struct job *j, const 
     print_sampler(w, j);
     dar_json_write_bool(w, "png", !o.no_png);
     dar_json_write_bool(w, "exr", o.exr);
+    dar_json_write_bool(w, "latent", o.latent);
+    dar_json_write_bool(w, "eval", o.eval);
     dar_json_write_bool(w, "mp4", !o.no_mp4);
     dar_json_write_bool(w, "mkv", o.mkv);
     dar_json_write_bool(w, "sheet", !o.no_sheet);
@@ -327,6 +351,7 @@ static dar_status print_settings(dar_json_writer *w, const struct job *j, const 
 /* What is heard of a video while it is made. */
 struct hearing {
     dar_output *output;
+    dar_preview preview; /* .v NULL: none */
     const char *path;
     dar_progress progress;
     double begun, ended[3]; /* [s] of the stages */
@@ -336,6 +361,13 @@ static dar_status hear_frame(void *ctx, size_t index, const uint8_t *rgb, dar_er
 {
     struct hearing *h = ctx;
     return dar_output_frame(h->output, index, rgb, e);
+}
+
+static dar_status hear_step(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e)
+{
+    struct hearing *h = ctx;
+    if (h->preview.v) DAR_TRY(dar_preview_show(&h->preview, done, clean, e));
+    return o.latent && done == (size_t)o.steps ? dar_output_latent(h->output, z, e) : DAR_OK;
 }
 
 static dar_status hear_stage(void *ctx, dar_pipeline_stage stage, size_t done, size_t of, dar_err *e)
@@ -376,18 +408,43 @@ static void tell_video(struct job *j, const dar_pipeline *p, const struct hearin
     dar_json_write_end(&j->r->json);
 }
 
+static dar_shape latent_of(const dar_pipeline *p)
+{
+    return DAR_SHAPE(1, p->m->c.dit.latent, p->frames, p->height, p->width);
+}
+
+/* OUT.preview.png */
+static dar_status begin_preview(struct hearing *h, const dar_pipeline *p, dar_err *e)
+{
+    char path[PATH_MAX];
+    size_t n = strlen(h->path);
+    if (!o.preview) return DAR_OK;
+    while (n > 1 && h->path[n - 1] == '/') n--;
+    if (snprintf(path, sizeof path, "%.*s.preview.png", (int)n, h->path) >= PATH_MAX)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", h->path);
+    return dar_preview_init(&h->preview, &p->m->taew, latent_of(p), (size_t)o.steps, path, e);
+}
+
+static void end_preview(struct hearing *h)
+{
+    if (h->preview.v) remove(h->preview.path);
+    dar_preview_free(&h->preview);
+}
+
 static dar_status render(struct job *j, dar_pipeline *p, const char *path, const uint8_t *rgb, const char *settings,
                          dar_err *e)
 {
-    const dar_output_options files = { !o.no_png, o.exr, !o.no_mp4, o.mkv, !o.no_sheet, o.overwrite };
-    struct hearing h = { .path = path, .begun = dar_log_clock() };
-    const dar_pipeline_listener listener = { hear_frame, hear_stage, &h };
-    h.progress = dar_progress_begin(path, "steps", (double)o.steps);
+    const dar_output_options files = { !o.no_png, o.exr, !o.no_mp4, o.mkv, !o.no_sheet, o.eval, o.overwrite };
     const dar_output_shown shown = { &j->condition, &p->cond, rgb };
-    DAR_TRY(dar_output_create(&h.output, path, p->b, &shown, settings, &files, e));
-    dar_status s = dar_pipeline_render(p, rgb, &listener, e);
-    dar_progress_end(&h.progress);
+    struct hearing h = { .path = path, .begun = dar_log_clock() };
+    const dar_pipeline_listener listener = { hear_frame, hear_stage, hear_step, &h };
+    h.progress = dar_progress_begin(path, "steps", (double)o.steps);
+    dar_status s = dar_output_create(&h.output, path, p->b, &shown, settings, &files, e);
+    if (s == DAR_OK) s = begin_preview(&h, p, e);
+    if (s == DAR_OK) s = dar_pipeline_render(p, rgb, &listener, e);
+    if (h.output) dar_progress_end(&h.progress);
     if (s == DAR_OK) s = dar_output_commit(h.output, e);
+    end_preview(&h);
     dar_output_discard(h.output);
     if (s == DAR_OK) tell_video(j, p, &h);
     return s;
@@ -428,7 +485,10 @@ static void tell_plan(struct job *j, const dar_pipeline *p, const char *bundle)
     dar_json_writer *w = &j->r->json;
     char time[32];
     const double video = p->encode + p->sample + p->decode;
-    const size_t videos = o.references.n ? o.references.n : 1, bytes = j->m->bytes + p->bytes;
+    size_t preview[3] = { 0 };
+    if (o.preview && dar_preview_plan(&j->m->taew, latent_of(p), preview, NULL) != DAR_OK) *preview = 0;
+    const size_t videos = o.references.n ? o.references.n : 1;
+    const size_t bytes = j->m->bytes + p->bytes + preview[0] + preview[1] + preview[2];
     dar_json_write_int(w, "memory_bytes", (int64_t)bytes);
     dar_json_write_int(w, "weights_bytes", (int64_t)j->m->bytes);
     dar_json_write_object(w, "flops");

@@ -8,12 +8,15 @@
 #include <string.h>
 #include <sys/stat.h>
 
+#include "data/metric.h"
 #include "data/png.h"
 #include "data/sheet.h"
 #include "data/video.h"
 #include "infer/layers.h"
 #include "lib/dir.h"
 #include "lib/file.h"
+#include "lib/json_write.h"
+#include "lib/safetensors_write.h"
 #include "lib/size.h"
 
 #define COLUMNS 5
@@ -21,6 +24,15 @@
 #define LOUDER  4   /* distances are shown so many times as large */
 
 enum { MP4, MKV, VIDEOS };
+
+/* Distance from the truth; numbers that do not exist are null. */
+struct eval {
+    dar_metric *metric;
+    dar_metric_clip clip;
+    dar_json_writer json; /* inside its list of frames */
+    float *cover;         /* [H, W] of the mesh */
+    uint8_t *mask;
+};
 
 struct dar_output {
     dar_output_options o;
@@ -30,6 +42,7 @@ struct dar_output {
     dar_sheet sheet;
     dar_layers layers;
     const char *settings;
+    struct eval eval;
     size_t width, height, columns, latent; /* latent: frames of the grid that columns are chosen from */
     size_t result;                         /* row of it; after it ground truth and distance */
     uint8_t *truth, *map;                  /* [H, W, 3] */
@@ -123,6 +136,59 @@ static dar_status draw_result(dar_output *o, size_t column, size_t index, const 
     return DAR_OK;
 }
 
+/* ---------------------------------------------------------------- metrics */
+
+static dar_status begin_eval(dar_output *o, const uint8_t *reference, dar_err *e)
+{
+    struct eval *v = &o->eval;
+    size_t n = o->width * o->height;
+    if (!o->b->rgb)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: --eval: the bundle has no rgb.h5 to compare with", o->dir.path);
+    v->cover = malloc(n * sizeof *v->cover);
+    v->mask = malloc(n);
+    if (!v->cover || !v->mask) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", o->dir.path);
+    DAR_TRY(dar_metric_open(&v->metric, o->width, o->height, DAR_METRIC_ALL, e));
+    dar_metric_begin(v->metric, reference);
+    v->json.pretty = true;
+    dar_json_write_object(&v->json, NULL);
+    dar_json_write_array(&v->json, "frames");
+    return DAR_OK;
+}
+
+static void print_row(dar_json_writer *w, const char *key, const dar_metric_row *row)
+{
+    static const char *const area[DAR_METRIC_AREAS] = { "frame", "mask" };
+    dar_json_write_object(w, key);
+    for (int a = 0; a < DAR_METRIC_AREAS; a++) {
+        dar_json_write_object(w, area[a]);
+        for (int k = 0; k < DAR_METRICS; k++) dar_json_write_number(w, dar_metric_table[k].name, row->v[a][k]);
+        dar_json_write_end(w);
+    }
+    dar_json_write_end(w);
+}
+
+static dar_status eval_frame(dar_output *o, size_t index, const uint8_t *rgb, dar_err *e)
+{
+    struct eval *v = &o->eval;
+    dar_metric_row row;
+    bool mask = dar_bundle_has(o->b, DAR_FAMILY_MASK);
+    DAR_TRY(dar_bundle_rgb(o->b, index, o->truth, e));
+    if (mask) DAR_TRY(dar_bundle_values(o->b, DAR_FAMILY_MASK, index, v->cover, e));
+    for (size_t i = 0; mask && i < o->width * o->height; i++) v->mask[i] = (uint8_t)(255 * v->cover[i] + 0.5f);
+    dar_metric_frame(v->metric, rgb, o->truth, mask ? v->mask : NULL, &row);
+    dar_metric_clip_add(&v->clip, &row);
+    print_row(&v->json, NULL, &row);
+    return DAR_OK;
+}
+
+static void free_eval(struct eval *v)
+{
+    dar_metric_close(v->metric);
+    dar_json_writer_free(&v->json);
+    free(v->cover);
+    free(v->mask);
+}
+
 /* ---------------------------------------------------------------- files */
 
 static dar_status make_directory(const dar_output *o, const char *name, dar_err *e)
@@ -165,6 +231,7 @@ dar_status dar_output_create(dar_output **out, const char *path, dar_bundle *b, 
     dar_status s = dar_dir_create(&o->dir, path, e);
     if (s == DAR_OK && !(o->truth && o->map)) s = dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
     if (s == DAR_OK) s = begin_files(o, e);
+    if (s == DAR_OK && o->o.eval) s = begin_eval(o, shown->reference, e);
     if (s == DAR_OK && o->o.sheet) s = begin_sheet(o, shown, e);
     if (s == DAR_OK) *out = o;
     else dar_output_discard(o);
@@ -186,9 +253,18 @@ dar_status dar_output_frame(dar_output *o, size_t index, const uint8_t *rgb, dar
     }
     for (int i = 0; i < VIDEOS; i++)
         if (o->video[i]) DAR_TRY(dar_video_write(o->video[i], rgb, e));
+    if (o->o.eval) DAR_TRY(eval_frame(o, index, rgb, e));
     for (size_t k = 0; k < o->columns; k++)
         if (index == DAR_RAYS_GROUP * latent_of(o, k)) DAR_TRY(draw_result(o, k, index, rgb, e));
     return DAR_OK;
+}
+
+dar_status dar_output_latent(dar_output *o, const dar_tensor *z, dar_err *e)
+{
+    char path[PATH_MAX];
+    const dar_safetensors_item item = { "z", *z };
+    DAR_TRY(member(o, "latent.safetensors", path, e));
+    return dar_safetensors_write(path, &item, 1, NULL, e);
 }
 
 static dar_status write_text(const char *path, const char *text, dar_err *e)
@@ -202,6 +278,20 @@ static dar_status write_text(const char *path, const char *text, dar_err *e)
     return s;
 }
 
+static dar_status finish_eval(dar_output *o, dar_err *e)
+{
+    struct eval *v = &o->eval;
+    dar_metric_row mean;
+    char path[PATH_MAX];
+    dar_json_write_end(&v->json);
+    dar_metric_clip_mean(&v->clip, &mean);
+    print_row(&v->json, "mean", &mean);
+    dar_json_write_end(&v->json);
+    if (v->json.failed) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", o->dir.path);
+    DAR_TRY(member(o, "metrics.json", path, e));
+    return write_text(path, v->json.text, e);
+}
+
 dar_status dar_output_commit(dar_output *o, dar_err *e)
 {
     char path[PATH_MAX];
@@ -211,6 +301,7 @@ dar_status dar_output_commit(dar_output *o, dar_err *e)
         DAR_TRY(member(o, "sheet.png", path, e));
         DAR_TRY(dar_sheet_write(&o->sheet, path, e));
     }
+    if (o->o.eval) DAR_TRY(finish_eval(o, e));
     DAR_TRY(member(o, "sample.json", path, e));
     DAR_TRY(write_text(path, o->settings, e));
     return dar_dir_commit(&o->dir, o->o.overwrite, e);
@@ -223,6 +314,7 @@ void dar_output_discard(dar_output *o)
     dar_dir_discard(&o->dir);
     dar_sheet_free(&o->sheet);
     dar_layers_free(&o->layers);
+    free_eval(&o->eval);
     free(o->truth);
     free(o->map);
     free(o);

@@ -5,6 +5,8 @@
  *   exr/00000.exr      every frame with depth, matte and ids, for compositing (infer/layers.h)
  *   video.mp4          for people
  *   video.mkv          every frame, exact (FFV1)
+ *   latent.safetensors what the solver arrived at, z [1, C, F, h, w]
+ *   metrics.json       distance of the frames from the bundle's own: means, and frame by frame (data/metric.h)
  *   sheet.png          reference, geometry as the network sees it, result, ground truth and distance from it
  *
  * Pictures, videos and EXR files carry the text of sample.json as their comment.  The directory appears whole or not at
@@ -16,7 +18,7 @@
 #include "models/model.h"
 
 typedef struct dar_output_options {
-    bool png, exr, mp4, mkv, sheet;
+    bool png, exr, mp4, mkv, sheet, eval;
     bool overwrite;
 } dar_output_options;
 
@@ -36,6 +38,9 @@ dar_status dar_output_create(dar_output **out, const char *path, dar_bundle *b, 
 
 /* The next frame, rgb [H, W, 3]. */
 dar_status dar_output_frame(dar_output *o, size_t index, const uint8_t *rgb, dar_err *e);
+
+/* The latent, once. */
+dar_status dar_output_latent(dar_output *o, const dar_tensor *z, dar_err *e);
 
 /* All are there: finish the files, write sample.json, rename. */
 dar_status dar_output_commit(dar_output *o, dar_err *e);

@@ -199,8 +199,7 @@ struct steps {
 static dar_status step_done(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e)
 {
     const struct steps *s = ctx;
-    (void)z;
-    (void)clean;
+    if (s->l && s->l->step) DAR_TRY(s->l->step(s->l->ctx, done, z, clean, e));
     return tell(s->l, DAR_PIPELINE_SAMPLE, (int64_t)done, (int64_t)s->p->o.sampler.solver.steps, e);
 }
 

@@ -60,6 +60,10 @@ typedef struct dar_pipeline_listener {
     dar_status (*frame)(void *ctx, size_t index, const uint8_t *rgb, dar_err *e);
     /* After each latent frame, step, latent frame; NULL: nobody asks.  Anything but DAR_OK ends the work. */
     dar_status (*told)(void *ctx, dar_pipeline_stage stage, size_t done, size_t of, dar_err *e);
+    /* After each step, before that: the latent as it is, and where the step saw it go (models/sampler.h); NULL: as
+     * above.
+     */
+    dar_status (*step)(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e);
     void *ctx;
 } dar_pipeline_listener;
 

@@ -120,6 +120,15 @@ int64_t dar_vae_shrink_time(const dar_vae_config *c)
     return n;
 }
 
+static void read_taew(dar_taew_config *c, dar_json j, int64_t latent)
+{
+    int n = 4;
+    *c = (dar_taew_config){ .latent = latent, .decoder_width = { 256, 128, 64, 64 } };
+    c->encoder_width = dar_json_int(j, "encoder_width", 64, 1, MOST);
+    read_list(j, "decoder_width", 4, &n, c->decoder_width);
+    if (n != 4) dar_json_reject(j, "decoder_width", "4 numbers");
+}
+
 static unsigned read_targets(dar_json j)
 {
     dar_json list = dar_json_get(j, "targets");
@@ -148,6 +157,7 @@ void dar_config_read(dar_config *c, dar_json j)
     read_dit(&c->dit, dar_json_object(j, "dit"));
     read_adapter(&c->adapter, dar_json_object(j, "adapter"));
     read_vae(&c->vae, dar_json_get(j, "vae"), c->dit.latent);
+    read_taew(&c->taew, dar_json_object(j, "taew"), c->dit.latent);
     read_lora(&c->lora, dar_json_object(j, "lora"));
 }
 

@@ -33,6 +33,10 @@
  *   vae.decoder_blocks 1 .. 8          3
  *   vae.mean, vae.std  lists           0, 1     per latent channel: the transformer sees (z - mean) / std
  *
+ *   taew               object          public   of the tiny decoder of the same latent, for previews
+ *   taew.encoder_width 1 ..            64
+ *   taew.decoder_width list of 4       256 128 64 64
+ *
  *   lora.rank          0 ..            0        0: none
  *   lora.alpha         > 0             rank     the low-rank term counts alpha / rank times
  *   lora.targets       list of names   all ten  self_attn.q .k .v .o, cross_attn.q .k .v .o, ffn.0, ffn.2
@@ -100,11 +104,17 @@ typedef struct dar_vae_config {
     double mean[DAR_VAE_LATENT], std[DAR_VAE_LATENT];
 } dar_vae_config;
 
+typedef struct dar_taew_config {
+    int64_t latent, encoder_width;
+    int64_t decoder_width[4]; /* before the first up-sampling, after each */
+} dar_taew_config;
+
 typedef struct dar_config {
     char name[64];
     dar_dit_config dit;
     dar_adapter_config adapter;
     dar_vae_config vae;
+    dar_taew_config taew;
     dar_lora_config lora;
 } dar_config;
 

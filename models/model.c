@@ -10,7 +10,7 @@
 #include "models/load.h"
 #include "models/lora.h"
 
-const char *const dar_model_part_name[] = { "dit", "vae", "adapter", "lora", NULL };
+const char *const dar_model_part_name[] = { "dit", "vae", "adapter", "lora", "taew", NULL };
 
 /* ---------------------------------------------------------------- files */
 
@@ -134,6 +134,7 @@ static void find_part(dar_model *m, const dar_model_file *f, const dar_model_opt
         { "vae.safetensors", "vae.pth", "Wan2.2_VAE.pth" },
         { "adapter.safetensors" },
         { "lora.safetensors" },
+        { "taew.safetensors", "taew2_2.safetensors", "taew2_2.pth" },
     };
     char directory[PATH_MAX], *path = m->path[part];
     snprintf(directory, sizeof directory, "%s", f->path);
@@ -157,13 +158,14 @@ static void find_part(dar_model *m, const dar_model_file *f, const dar_model_opt
 
 static bool needs(const dar_model_options *o, int part)
 {
-    return !o->plan && (part == DAR_MODEL_VAE || part == DAR_MODEL_DIT);
+    if (o->plan || o->random) return false;
+    return part == DAR_MODEL_VAE || part == DAR_MODEL_DIT || (part == DAR_MODEL_TAEW && o->preview);
 }
 
 static dar_status open_parts(dar_model *m, const dar_model_file *f, const dar_model_options *o, dar_err *e)
 {
     for (int i = 0; i < DAR_MODEL_PARTS; i++) {
-        if (o->fresh && i != DAR_MODEL_VAE) continue;
+        if ((o->fresh && i != DAR_MODEL_VAE) || (i == DAR_MODEL_TAEW && !o->preview)) continue;
         find_part(m, f, o, (dar_model_part)i);
         if (*m->path[i]) DAR_TRY(dar_weights_open(&m->open[i], m->path[i], e));
         else if (needs(o, i))
@@ -180,24 +182,34 @@ static dar_status open_parts(dar_model *m, const dar_model_file *f, const dar_mo
 /* Planning, fresh values stand for those of files: what is mapped then counts as memory, and nothing is told twice. */
 static dar_status fill(dar_model *m, const dar_model_options *o, dar_err *e)
 {
-    dar_params *dit = &m->params[0], *vae = &m->params[1];
+    dar_params *dit = &m->params[0], *vae = &m->params[1], *taew = &m->params[2];
     const unsigned networks = DAR_PARAM_BASE | DAR_PARAM_ADAPTER;
     dar_weights *const *open = m->open;
     if (!m->weights.plan) {
         if (open[DAR_MODEL_ADAPTER]) DAR_TRY(dar_load_adapter(&m->dit, dit, open[DAR_MODEL_ADAPTER], o->seed, e));
         if (open[DAR_MODEL_DIT]) DAR_TRY(dar_load_dit(&m->dit, dit, open[DAR_MODEL_DIT], o->seed, e));
-        DAR_TRY(dar_load_vae(vae, open[DAR_MODEL_VAE], e));
+        if (open[DAR_MODEL_VAE]) DAR_TRY(dar_load_vae(vae, open[DAR_MODEL_VAE], e));
+        if (open[DAR_MODEL_TAEW]) DAR_TRY(dar_load_vae(taew, open[DAR_MODEL_TAEW], e));
     }
     dar_params_fresh(dit, networks, o->seed);
     dar_params_fresh(vae, DAR_PARAM_ALL, o->seed);
+    dar_params_fresh(taew, DAR_PARAM_ALL, o->seed);
     return DAR_OK;
+}
+
+/* The first two blocks and the last three, which suffer most, stay as they are; of few blocks a quarter at each end. */
+static void quantise(dar_model *m, dar_arena *scratch)
+{
+    const int64_t layers = m->c.dit.layers, few = layers / 4;
+    dar_lora_quantise(&m->dit, &m->params[0], few < 2 ? few : 2, layers - (few < 3 ? few : 3), scratch);
+    m->dit.quantise = true;
 }
 
 static dar_status build(dar_model *m, const dar_model_options *o, dar_arena *scratch, dar_err *e)
 {
-    dar_params *dit = &m->params[0], *vae = &m->params[1];
-    dar_params_init(dit, &m->weights, o->storage);
-    dar_params_init(vae, &m->weights, o->storage);
+    dar_params *dit = &m->params[0], *vae = &m->params[1], *taew = &m->params[2];
+    for (size_t i = 0; i < DAR_COUNT(m->params); i++) dar_params_init(&m->params[i], &m->weights, o->storage);
+    if (o->preview) dar_taew_init(&m->taew, taew, &m->c.taew);
     dar_dit_init(&m->dit, dit, &m->c.dit, &m->c.adapter);
     dar_vae_init(&m->vae, vae, &m->c.vae);
     if (o->train & DAR_PARAM_LORA) dar_lora_init(&m->dit, dit, &m->c.lora);
@@ -210,7 +222,9 @@ static dar_status build(dar_model *m, const dar_model_options *o, dar_arena *scr
     }
     dar_params_fresh(dit, DAR_PARAM_LORA, o->seed);
     dar_params_gradients(dit);
+    if (o->eight) quantise(m, scratch);
     dar_vae_fold(&m->vae, &m->weights);
+    if (o->preview) dar_taew_prepare(&m->taew, &m->weights);
     return DAR_OK;
 }
 

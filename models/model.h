@@ -14,7 +14,8 @@
  *   dit      dit.safetensors, or diffusion_pytorch_model.safetensors, or either as shards with an index
  *   vae      vae.safetensors, or Wan2.2_VAE.pth
  *   adapter  adapter.safetensors, if it is there: used instead of the one that dit holds
- *   lora     lora.safetensors, if it is there */
+ *   lora     lora.safetensors, if it is there
+ *   taew     taew.safetensors, taew2_2.safetensors or taew2_2.pth, where previews are asked for */
 #ifndef DAR_MODELS_MODEL_H
 #define DAR_MODELS_MODEL_H
 
@@ -23,6 +24,7 @@
 #include "lib/json.h"
 #include "lib/weights.h"
 #include "models/dit.h"
+#include "models/taew.h"
 #include "models/vae.h"
 
 typedef enum dar_model_part {
@@ -30,6 +32,7 @@ typedef enum dar_model_part {
     DAR_MODEL_VAE,
     DAR_MODEL_ADAPTER,
     DAR_MODEL_LORA,
+    DAR_MODEL_TAEW,
     DAR_MODEL_PARTS
 } dar_model_part;
 
@@ -72,6 +75,9 @@ typedef struct dar_model_options {
     double strength;                   /* of the low-rank additions */
     bool apart;                        /* they are not merged into the weights */
     bool plan;                         /* the networks lie on a planning arena; weights need not be there */
+    bool random;                       /* weights that have no file are drawn from `seed`: to try speed and memory */
+    bool eight;   /* products of the middle blocks are of 8 bits by 8 bits; additions are merged first */
+    bool preview; /* the tiny decoder is wanted */
 
     /* Training: roles that get gradients; additions of config.lora are made if they are among them.  `fresh`: the
      * transformer's values are drawn from `seed`, not read, as are those of new additions always. */
@@ -84,13 +90,14 @@ typedef struct dar_model {
     dar_config c;
     dar_dit dit;
     dar_vae vae;
+    dar_taew taew;                        /* if it was wanted */
     char file[PATH_MAX];                  /* the JSON */
     char path[DAR_MODEL_PARTS][PATH_MAX]; /* of the weights; "": none */
     size_t bytes;                         /* of the weights in memory, mapped ones included, at most */
 
     /* Of the model itself. */
     dar_arena weights;
-    dar_params params[2]; /* of dit and vae */
+    dar_params params[3]; /* of dit, vae and taew */
     dar_weights *open[DAR_MODEL_PARTS];
 } dar_model;
 

@@ -20,11 +20,6 @@
 #include "models/params.h"
 #include "models/vae.h"
 
-typedef struct dar_taew_config {
-    int64_t latent, encoder_width;
-    int64_t decoder_width[4]; /* before the first up-sampling, after each */
-} dar_taew_config;
-
 /* That of the public weights: 1,494,576 numbers in the encoder, 9,923,532 in the decoder. */
 extern const dar_taew_config dar_taew_public;
 

@@ -15,7 +15,9 @@
 #include "lib/json.h"
 #include "lib/rng.h"
 #include "lib/safetensors_write.h"
+#include "lib/weights.h"
 #include "models/dit.h"
+#include "models/taew.h"
 #include "models/vae.h"
 
 #define W      40
@@ -40,6 +42,7 @@ static const char model[] = "{\"name\": \"small\","
                             "\"vae\": {\"patch\": 1, \"multipliers\": [1, 2, 2], \"halve_time\": [true, true],"
                             "\"encoder_width\": 3, \"decoder_width\": 4, \"encoder_blocks\": 1,"
                             "\"decoder_blocks\": 1},"
+                            "\"taew\": {\"encoder_width\": 6, \"decoder_width\": [8, 7, 6, 4]},"
                             "\"condition\": {\"channels\": \"world\", \"geometry_frame\": \"camera0\"}}";
 
 static void write_weights(const char *path, const dar_params *p)
@@ -66,9 +69,10 @@ static void fill(dar_params *p)
 static void write_model(const char *path)
 {
     dar_arena a;
-    dar_params dit_params, vae_params;
+    dar_params dit_params, vae_params, taew_params;
     dar_dit dit = { 0 };
     dar_vae vae = { 0 };
+    dar_taew taew = { 0 };
     dar_config c;
     dar_condition condition;
     dar_json_doc *doc;
@@ -88,13 +92,19 @@ static void write_model(const char *path)
     dar_params_init(&vae_params, &a, DAR_F32);
     dar_dit_init(&dit, &dit_params, &c.dit, &c.adapter);
     dar_vae_init(&vae, &vae_params, &c.vae);
+    dar_params_init(&taew_params, &a, DAR_F32);
+    dar_taew_init(&taew, &taew_params, &c.taew);
+    fill(&taew_params);
     fill(&dit_params);
     fill(&vae_params);
     snprintf(name, sizeof name, "%s/dit.safetensors", path);
     write_weights(name, &dit_params);
     snprintf(name, sizeof name, "%s/vae.safetensors", path);
     write_weights(name, &vae_params);
+    snprintf(name, sizeof name, "%s/taew2_2.safetensors", path);
+    write_weights(name, &taew_params);
     dar_dit_free(&dit);
+    dar_params_free(&taew_params);
     dar_params_free(&dit_params);
     dar_params_free(&vae_params);
     dar_arena_free(&a);
@@ -402,6 +412,96 @@ static void solvers_and_noise(void **state)
     dar_arena_free(&a);
 }
 
+/* It is there while the video is made, and gone when that is. */
+static void preview(void **state)
+{
+    (void)state;
+    dar_image im;
+    dar_file_map m;
+    dar_err e;
+    bool shown = false;
+    const char *const words[] = { "seen",    "-o",  "film/",    "--model",   "model",
+                                  "--steps", "200", "--no-mp4", "--preview", NULL };
+    for (int tries = 0; tries < 5 && !shown; tries++) {
+        pid_t pid = run_start(program, words);
+        for (int wait = 0; wait < 4000 && !shown; wait++) {
+            shown = dar_file_map_open(&m, "film.preview.png", NULL) == DAR_OK;
+            nanosleep(&(struct timespec){ .tv_nsec = 500000 }, NULL);
+        }
+        if (shown) {
+            CHECK(dar_png_probe(&im, "preview", m.data, m.size, &e) == DAR_OK, "%s", e.text);
+            CHECK(im.width > 200 && im.height > 50, "%zu x %zu", im.width, im.height);
+            dar_file_map_close(&m);
+        }
+        if (tries == 0) kill(pid, SIGINT);
+        run_finish(pid);
+        assert_false(run_is_there("film.preview.png"));
+    }
+    CHECK(shown, "never shown: %s", ran.err);
+    int status = run_finish(run_start(program, words));
+    CHECK(status == 0, "status %d: %s", status, ran.err);
+    assert_false(run_is_there("film.preview.png"));
+    BAD(2, "--taew FILE", "seen", "-o", "x", MODEL, "--preview", "--weights", "frames", "--dit",
+        "model/dit.safetensors", "--vae", "model/vae.safetensors");
+    GOOD("clip", "-o", "never", MODEL, "--preview", "--dry-run");
+}
+
+/* 8 bits change little; weights may be drawn; the latent is what frames are decoded from. */
+static void precisions(void **state)
+{
+    (void)state;
+    dar_weights *f;
+    dar_tensor z;
+    dar_err e;
+    GOOD("clip", "-o", "p16", "--model", "model", "--steps", "2", "--no-mp4", "--reference", "a.png", "--latent");
+    GOOD("clip", "-o", "p8", "--model", "model", "--steps", "2", "--no-mp4", "--reference", "a.png", "--latent",
+         "--precision", "int8");
+    double sum[2] = { 0 };
+    for (int i = 0; i < 2; i++) {
+        assert_int_equal(dar_weights_open(&f, i ? "p8/latent.safetensors" : "p16/latent.safetensors", &e), DAR_OK);
+        assert_int_equal(dar_weights_tensor(f, "z", &z, &e), DAR_OK);
+        static double before[5 * 3 * 60];
+        assert_int_equal(dar_tensor_count(&z), DAR_COUNT(before));
+        for (size_t k = 0; k < DAR_COUNT(before); k++) {
+            double x = dar_dtype_get(z.dtype, z.data, k);
+            if (i) sum[0] += (x - before[k]) * (x - before[k]), sum[1] += x * x;
+            before[k] = x;
+        }
+        dar_weights_close(f);
+    }
+    double off = sqrt(sum[0] / sum[1]);
+    printf("note: int8 against bf16, latent of two blocks after two steps: %.1e\n", off);
+    CHECK(off > 1e-6, "nothing is rounded");
+    CHECK_NEAR("int8", off, 0, 0.05);
+
+    assert_int_equal(mkdir("bare", 0777), 0);
+    run_write("bare/model.json", model, sizeof model - 1);
+    GOOD("clip", "-o", "drawn", "--model", "bare", "--random", "--steps", "2", "--no-mp4", "--reference", "a.png");
+    BAD(2, "--dit FILE", "clip", "-o", "x", "--model", "bare", "--reference", "a.png");
+}
+
+/* The first frame is nearly the reference, which is the truth's first. */
+static void against_the_truth(void **state)
+{
+    (void)state;
+    dar_json_doc *doc;
+    dar_err e;
+    GOOD("seen", "-o", "judged", MODEL, "--eval");
+    CHECK(dar_json_open(&doc, "judged/metrics.json", &e) == DAR_OK, "%s", e.text);
+    dar_json root = dar_json_root(doc), mean = dar_json_object(dar_json_object(root, "mean"), "frame");
+    size_t frames = 0;
+    double sum = 0;
+    for (dar_json x = dar_json_first(dar_json_array(root, "frames")); x.item; x = dar_json_next(x)) {
+        sum += dar_json_number(dar_json_object(x, "frame"), "psnr", NAN, 0, 100);
+        frames++;
+    }
+    assert_int_equal(frames, T);
+    CHECK_NEAR("mean", dar_json_number(mean, "psnr", NAN, 0, 100), sum / T, 1e-9);
+    CHECK(dar_json_number(mean, "refl1", NAN, 0, 255) > 0, "no distance from the reference");
+    dar_json_close(doc);
+    BAD(2, "no rgb.h5", "clip", "-o", "x", MODEL, "--reference", "a.png", "--eval");
+}
+
 static bool holds(const char *path, const char *words)
 {
     dar_file_map m;
@@ -535,9 +635,10 @@ static int remove_directory(void **state)
 int main(int argc, char **argv)
 {
     static const struct CMUnitTest tests[] = {
-        cmocka_unit_test(a_video),  cmocka_unit_test(any_threads), cmocka_unit_test(batches),
-        cmocka_unit_test(stopped),  cmocka_unit_test(ten_clips),   cmocka_unit_test(solvers_and_noise),
-        cmocka_unit_test(layers),   cmocka_unit_test(windows),     cmocka_unit_test(dry_run),
+        cmocka_unit_test(a_video),    cmocka_unit_test(any_threads),       cmocka_unit_test(batches),
+        cmocka_unit_test(stopped),    cmocka_unit_test(ten_clips),         cmocka_unit_test(solvers_and_noise),
+        cmocka_unit_test(layers),     cmocka_unit_test(against_the_truth), cmocka_unit_test(preview),
+        cmocka_unit_test(precisions), cmocka_unit_test(windows),           cmocka_unit_test(dry_run),
         cmocka_unit_test(refusals),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
