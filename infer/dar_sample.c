@@ -119,6 +119,7 @@ struct job {
     dar_pipeline_options how;
     char **bundle, **reference; /* names; end with NULL */
     size_t done, kept;
+    double prepare; /* [s] of the clip */
 };
 
 /* ---------------------------------------------------------------- what is asked for */
@@ -470,7 +471,11 @@ static dar_status make_video(struct job *j, int bundle, dar_bundle *b, size_t i,
         return dar_fail(e, DAR_ERR_USAGE, "%s: found something made otherwise, expected --overwrite or another -o",
                         path);
     dar_status s = load_reference(b, reference, in, &rgb, e);
-    if (s == DAR_OK && !*p) s = dar_pipeline_open(p, j->m, &j->condition, in, b, &j->how, e);
+    if (s == DAR_OK && !*p) {
+        double begun = dar_log_clock();
+        s = dar_pipeline_open(p, j->m, &j->condition, in, b, &j->how, e);
+        j->prepare = dar_log_clock() - begun;
+    }
     if (s == DAR_OK) s = render(j, *p, path, rgb, settings, e);
     free(rgb);
     if (s == DAR_OK) j->done++;
@@ -500,7 +505,10 @@ static void tell_plan(struct job *j, const dar_pipeline *p, const char *bundle)
     dar_json_write_object(w, "flops_saved");
     for (int k = 0; k < DAR_SKIPS; k++) dar_json_write_number(w, dar_skip_name[k], p->saved[k]);
     dar_json_write_end(w);
-    if (!o.common.dry_run) return;
+    if (!o.common.dry_run) {
+        dar_json_write_number(w, "seconds_prepare", j->prepare);
+        return;
+    }
     double seconds = (p->prepare + (double)videos * video) / dar_rate((dar_dtype)o.precision);
     dar_run_say(j->r,
                 "%s: %zu video%s of %zu frames of %d x %d: %.2f GB of memory (weights %.2f), %.3g TFLOP, at least %s",

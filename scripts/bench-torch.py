@@ -37,65 +37,15 @@ def torch_case(size, dtype, compiled):
     import torch.nn as nn
     import torch.nn.functional as F
 
+    import torch_dit
+
     start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     torch.set_num_threads(THREADS)
     torch.manual_seed(0)
     blocks, tokens, text, D, heads, ffn = size
-    E, storage = D // heads, {"f32": torch.float32, "bf16": torch.bfloat16}[dtype]
-
-    class Product(nn.Module):
-        def __init__(self, n_in, n_out):
-            super().__init__()
-            self.base = nn.Linear(n_in, n_out).to(storage).requires_grad_(False)
-            self.down = nn.Parameter(torch.randn(RANK, n_in).mul(0.02).to(storage))
-            self.up = nn.Parameter(torch.randn(n_out, RANK).mul(0.02).to(storage))
-
-        def forward(self, x):
-            y = self.base(x)
-            return y + F.linear(F.linear(x, self.down), self.up) if torch.is_grad_enabled() else y
-
-    def rms(x, w):
-        f = x.float()
-        return (f * torch.rsqrt(f.square().mean(-1, keepdim=True) + 1e-6)).to(x.dtype) * w
-
-    angle = torch.rand(tokens, 1, E // 2)
-    cos, sin = angle.cos(), angle.sin()
-
-    def rope(x):  # [B, N, A, E]
-        a, b = x.float().unflatten(-1, (-1, 2)).unbind(-1)
-        return torch.stack((a * cos - b * sin, a * sin + b * cos), -1).flatten(-2).to(x.dtype)
-
-    class Attention(nn.Module):
-        def __init__(self, own):
-            super().__init__()
-            self.q, self.k, self.v, self.o = (Product(D, D) for _ in range(4))
-            self.w = nn.ParameterList([nn.Parameter(torch.ones(D, dtype=storage), requires_grad=False)] * 2)
-            self.own = own
-
-        def forward(self, x, context):
-            q, k = rms(self.q(x), self.w[0]), rms(self.k(context), self.w[1])
-            q, k, v = (y.unflatten(-1, (heads, E)) for y in (q, k, self.v(context)))
-            if self.own:
-                q, k = rope(q), rope(k)
-            y = F.scaled_dot_product_attention(*(y.transpose(1, 2) for y in (q, k, v)))
-            return self.o(y.transpose(1, 2).flatten(2))
-
-    class Block(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.own, self.cross = Attention(True), Attention(False)
-            self.up, self.down = Product(D, ffn), Product(ffn, D)
-            self.modulation = nn.Parameter(torch.randn(1, 6, 1, D) / D**0.5, requires_grad=False)
-
-        def forward(self, x, context, e):  # x f32
-            shift, scale, gate, shift2, scale2, gate2 = (self.modulation + e).unbind(1)
-            h = (F.layer_norm(x, (D,), eps=1e-6) * (1 + scale) + shift).to(storage)
-            x = x + self.own(h, h).float() * gate
-            x = x + self.cross(F.layer_norm(x, (D,), eps=1e-6).to(storage), context).float()
-            h = (F.layer_norm(x, (D,), eps=1e-6) * (1 + scale2) + shift2).to(storage)
-            return x + self.down(F.gelu(self.up(h), approximate="tanh")).float() * gate2
-
-    net = nn.ModuleList(Block() for _ in range(blocks))
+    storage = {"f32": torch.float32, "bf16": torch.bfloat16}[dtype]
+    angle = torch.rand(tokens, 1, D // heads // 2)
+    net = nn.ModuleList(torch_dit.Block(D, heads, ffn, storage, RANK, angle) for _ in range(blocks))
     x, target = torch.randn(1, tokens, D), torch.randn(1, tokens, D)
     context, e = torch.randn(1, text, D).to(storage), torch.randn(1, 6, 1, D) * 0.1
 
