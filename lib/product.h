@@ -4,8 +4,9 @@
  * needs them (a convolution gathers its windows there).  Finished tiles of C go through another callback while they are
  * in the nearest cache.
  *
- * Order of summation: k is cut in blocks of a length that depends on m and k alone; within a block as the tile says,
- * the blocks' sums one after the other, the terms in order.  So C has the same bits for any number of threads. */
+ * Order of summation: k is cut in blocks of a length that depends on k, on m, and on the tile, which m and n choose;
+ * within a block as the tile says, the blocks' sums one after the other, the terms in order.  So C has the same bits
+ * for any number of threads; a row of it may have others in a product of other sizes. */
 #ifndef DAR_LIB_PRODUCT_H
 #define DAR_LIB_PRODUCT_H
 

@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "lib/log.h"
+#include "lib/thread.h"
 
 static volatile sig_atomic_t asked_to_stop;
 
@@ -71,6 +72,7 @@ int dar_program_main(const dar_program *program, int argc, char **argv)
     dar_program p = *program;
     const dar_program *command;
     dar_err e;
+    dar_threads_restart(argv);
     dar_status s = dar_args_parse(&p, argc, argv, &e);
     if (s == DAR_OK && dar_args_answer(&p, stdout)) return 0;
     if (s == DAR_OK && p.commands) {

@@ -21,7 +21,8 @@ typedef struct dar_run {
     dar_json_writer json;       /* inside the result's object */
 } dar_run;
 
-/* Parse, answer --help and --version, choose the command, run, print.  Returns the exit status. */
+/* Restart with patient threads (lib/thread.h), parse, answer --help and --version, choose the command, run, print.
+ * Returns the exit status. */
 int dar_program_main(const dar_program *program, int argc, char **argv);
 
 /* A line of the result for people; with --json nothing. */

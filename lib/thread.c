@@ -2,6 +2,8 @@
 #include "lib/thread.h"
 
 #include <omp.h>
+#include <stdlib.h>
+#include <unistd.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdlib.h>
@@ -21,6 +23,15 @@ void dar_threads_set(int n)
 {
     DAR_ASSERT(n >= 1, "threads: %d, expected at least 1", n);
     wanted = n;
+}
+
+/* Some microseconds: longer than it takes to start a task, shorter than to be put on a processor again. */
+#define SPINS "1000"
+
+void dar_threads_restart(char *const argv[])
+{
+    if (getenv("OMP_WAIT_POLICY") || getenv("GOMP_SPINCOUNT")) return;
+    if (setenv("GOMP_SPINCOUNT", SPINS, 1) == 0) execv("/proc/self/exe", argv);
 }
 
 bool dar_in_task(void)

@@ -405,10 +405,41 @@ static int asked_to_stop(const char *number)
     static const dar_program program = { .name = "saver", .run = until_asked };
     char *argv[] = { "saver", NULL };
     signal_number = (int)strtol(number, NULL, 10);
+    setenv("GOMP_SPINCOUNT", "0", 1); /* the test is not to be started again as the program */
     return dar_program_main(&program, 1, argv);
 }
 
+/* The program starts again once, with its words, and finds the environment set; it leaves alone what is set. */
+static int restarted(char **argv)
+{
+    if (strcmp(argv[1], "set") == 0) setenv("OMP_WAIT_POLICY", "active", 1);
+    else if (getenv("GOMP_SPINCOUNT")) return 7;
+    else unsetenv("OMP_WAIT_POLICY");
+    dar_threads_restart(argv);
+    return getenv("GOMP_SPINCOUNT") ? 1 : 8;
+}
+
 static char *self;
+
+static void restart(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *word;
+        int status;
+    } cases[] = { { "restart", 7 }, { "set", 8 } };
+    for (size_t i = 0; i < DAR_COUNT(cases); i++) {
+        char word[16];
+        snprintf(word, sizeof word, "%s", cases[i].word);
+        char *argv[] = { self, word, "again", NULL };
+        pid_t pid;
+        int how;
+        unsetenv("GOMP_SPINCOUNT");
+        assert_int_equal(posix_spawn(&pid, self, NULL, NULL, argv, environ), 0);
+        assert_int_equal(waitpid(pid, &how, 0), pid);
+        CHECK(WIFEXITED(how) && WEXITSTATUS(how) == cases[i].status, "%s: ended as %d", word, how);
+    }
+}
 
 static void stop_signals(void **state)
 {
@@ -429,12 +460,13 @@ static void stop_signals(void **state)
 int main(int argc, char **argv)
 {
     if (argc == 2) return asked_to_stop(argv[1]);
+    if (argc == 3) return restarted(argv);
     self = argv[0];
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(defaults),     cmocka_unit_test(everything),    cmocka_unit_test(words),
         cmocka_unit_test(refusals),     cmocka_unit_test(help),          cmocka_unit_test(common_block),
         cmocka_unit_test(events),       cmocka_unit_test(progress_text), cmocka_unit_test(commands),
-        cmocka_unit_test(stop_signals),
+        cmocka_unit_test(stop_signals), cmocka_unit_test(restart),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }

@@ -230,7 +230,7 @@ static void finishing(void)
 /* The same bits for 1, 2, 3 and 7 threads. */
 static void threads(void)
 {
-    static const size_t shape[][3] = { { 300, 200, 1300 }, { 16, 500, 300 }, { 500, 16, 300 }, { 40, 40, 40 } };
+    static const size_t shape[][3] = { { 300, 200, 2100 }, { 16, 500, 300 }, { 500, 16, 300 }, { 40, 40, 40 } };
     int old = dar_threads();
     for (size_t o = 0; o < DAR_COUNT(operands); o++)
         for (size_t s = 0; has(operands[o].kind) && s < DAR_COUNT(shape); s++) {
