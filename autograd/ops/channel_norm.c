@@ -10,9 +10,9 @@
 #include "lib/kern.h"
 #include "lib/thread.h"
 
-#define BLOCK 65536 /* elements of a block, at most, unless there are more than 512 channels */
-#define STRIP 128   /* places; blocks are whole strips */
-#define LEAST 1e-24 /* of a squared norm */
+#define BLOCK 131072 /* elements of a block, at most, unless there are more than 512 channels */
+#define STRIP 128    /* places; blocks are whole strips */
+#define LEAST 1e-24  /* of a squared norm */
 
 enum { X, W };
 
