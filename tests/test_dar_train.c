@@ -230,6 +230,8 @@ static void refusals(void **state)
     BAD(2, "did you mean 'rank'?", "lora.json", SET("ran=5"));
     BAD(2, "no weights of the dit", "lora.json", SET("model=small"), SET("output_dir=bad"));
     BAD(3, "this run needs", "lora.json", SET("output_dir=bad"), "--mem-budget", "0.000001");
+    GOOD("lora.json", SET("output_dir=bad"), "--mem-budget", "0.000001", "--dry-run");
+    CHECK(strstr(ran.out, "it would not start"), "a dry run: %s", ran.out);
     CHECK(!run_is_there("bad"), "what was refused left a directory");
 }
 

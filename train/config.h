@@ -49,10 +49,12 @@
  *   loss.stratified              bool             false    those of a batch from equal parts of that
  *   loss.weighting               flat | bell      flat     how they count
  *   loss.first_frame             exclude | include | noisy   exclude   the first latent frame: clean, at time 0, and
- * not counted; counted, as in VideoX-Fun; noisy like the others text.dropout                 0 .. 1           0.1 clips
- * whose text is left out text.empty                   text             null     file with the embedding of the empty
- * prompt, which stands for a text left out, or none; null: no token posterior                    mean | sample    mean
- * of the autoencoder, for clean latents
+ *                                                          not counted; counted, as in VideoX-Fun; noisy, all alike
+ *
+ *   text.dropout                 0 .. 1           0.1      clips whose text is left out
+ *   text.empty                   text             null     file with the embedding of the empty prompt, which stands
+ *                                                          for a text left out, or none; null: no token
+ *   posterior                    mean | sample    mean     of the autoencoder, for clean latents
  *
  *   validation.data              list of texts    []       bundles to look at while training
  *   validation.steps             0 ..             1000     every so many steps; 0: never

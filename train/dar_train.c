@@ -57,6 +57,8 @@ static void say_plan(dar_run *r, const dar_train_config *c, const dar_trainer_pl
         r, "memory       %.3f GB: weights and gradients %.3f, moments %.3f, a step %.3f, batches %.3f, validation %.3f",
         gigabytes(dar_trainer_bytes(p)), gigabytes(p->weights), gigabytes(p->moments),
         gigabytes(s->bytes[0] + s->bytes[1]), gigabytes(p->batches), gigabytes(p->validation));
+    if (dar_trainer_bytes(p) > p->budget)
+        dar_run_say(r, "             more than the %.3f GB that it may take: it would not start", gigabytes(p->budget));
     for (int k = DAR_RECOMPUTE_NONE; k <= DAR_RECOMPUTE_ALL; k++)
         dar_run_say(r, "  recompute %-9s  a step %.3f GB, %.3f TFLOP%s", dar_recompute_name[k],
                     gigabytes(p->step[k].bytes[0] + p->step[k].bytes[1]),
@@ -80,6 +82,7 @@ static void print_plan(dar_json_writer *w, const dar_train_config *c, const dar_
     dar_json_write_int(w, "batch_bytes", (int64_t)p->batches);
     dar_json_write_int(w, "validation_bytes", (int64_t)p->validation);
     dar_json_write_int(w, "bytes", (int64_t)dar_trainer_bytes(p));
+    dar_json_write_int(w, "budget", (int64_t)p->budget);
     dar_json_write_text(w, "recompute", dar_recompute_name[p->how]);
     dar_json_write_number(w, "tokens", p->tokens);
     dar_json_write_number(w, "flops", p->flops);

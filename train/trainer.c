@@ -101,20 +101,16 @@ static dar_status plan_step(dar_trainer *t, dar_err *e)
                         t->clips.path[0]);
     DAR_TRY(dar_step_count(p->step, c, &t->m->dit, &size, e));
     size_t rest = p->weights + p->moments + p->batches + p->validation;
-    size_t budget = c->budget > 0 ? (size_t)(c->budget * 1e9) : p->machine;
-    p->how = dar_step_choose(c, p->step, budget > rest ? budget - rest : 0);
+    p->how = dar_step_choose(c, p->step, p->budget > rest ? p->budget - rest : 0);
     p->tokens = (double)(z.d[0] * z.d[2] * (z.d[3] / d->patch) * (z.d[4] / d->patch) * c->accumulate);
     p->flops = (p->step[p->how].forward + p->step[p->how].backward) * (double)c->accumulate;
-    if (dar_trainer_bytes(p) > budget)
-        return dar_fail(e, DAR_ERR_NOMEM, "this run needs %.2f GB of memory, found %.2f GB to use",
-                        (double)dar_trainer_bytes(p) / 1e9, (double)budget / 1e9);
     return DAR_OK;
 }
 
 /* Everything on planning arenas; closes what it opened. */
 static dar_status plan(dar_trainer *t, dar_err *e)
 {
-    t->plan.machine = memory_of_machine();
+    t->plan.budget = t->c->budget > 0 ? (size_t)(t->c->budget * 1e9) : memory_of_machine();
     t->plan.peak = dar_rate((dar_dtype)t->c->storage);
     DAR_TRY(open_model(t, true, e));
     count_parameters(t);
@@ -190,6 +186,10 @@ static dar_status fill_cache(dar_trainer *t, const dar_clips *clips, dar_err *e)
 static dar_status open_run(dar_trainer *t, const dar_trainer_options *o, dar_err *e)
 {
     const dar_train_config *c = t->c;
+    const dar_trainer_plan *p = &t->plan;
+    if (dar_trainer_bytes(p) > p->budget)
+        return dar_fail(e, DAR_ERR_NOMEM, "this run needs %.2f GB of memory, found %.2f GB to use",
+                        (double)dar_trainer_bytes(p) / 1e9, (double)p->budget / 1e9);
     DAR_TRY(open_model(t, false, e));
     DAR_TRY(init_optim(t, e));
     DAR_TRY(describe(t, e));

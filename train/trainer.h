@@ -24,7 +24,7 @@ typedef struct dar_trainer_options {
 typedef struct dar_trainer_plan {
     size_t trained, frozen;                       /* numbers */
     size_t weights, moments, batches, validation; /* [bytes]; weights: with gradients */
-    size_t machine;                               /* [bytes] of memory that it has */
+    size_t budget;                                /* [bytes] it may take: what was said, else the machine's memory */
     dar_step_plan step[DAR_RECOMPUTE_ALL + 1];
     dar_recompute how;
     double tokens, flops, peak; /* of a step; [FLOP] of a step; [FLOP/s] that products reach here */
