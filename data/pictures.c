@@ -19,7 +19,10 @@
 struct dar_pictures {
     const char *path;
     size_t width, height, frames, next;
+    bool any, resized;    /* any size is taken; one was another */
     dar_video *video;     /* or */
+    dar_video_info info;  /* of it */
+    uint8_t *own;         /* a frame of it, if it is of another size */
     struct dirent **file; /* [files] of the directory */
     int files;
 };
@@ -47,17 +50,22 @@ static dar_status decode(const char *path, const dar_file_map *m, dar_image *im,
     return s;
 }
 
-static dar_status load(const char *path, size_t width, size_t height, bool any, uint8_t *rgb, dar_err *e)
+/* *other: NULL: another size is refused; else told whether it was one. */
+static dar_status load(const char *path, size_t width, size_t height, bool *other, uint8_t *rgb, dar_err *e)
 {
     dar_file_map m;
     dar_image im;
     uint8_t *own = NULL;
     DAR_TRY(dar_file_map_open(&m, path, e));
     dar_status s = dar_image_probe(&im, path, m.data, m.size, e);
-    if (s == DAR_OK && !any) s = check_size(path, im.width, im.height, width, height, e);
+    if (s == DAR_OK && !other) s = check_size(path, im.width, im.height, width, height, e);
     if (s == DAR_OK) s = decode(path, &m, &im, &own, e);
-    if (s == DAR_OK && im.width == width && im.height == height) memcpy(rgb, own, 3 * width * height);
-    else if (s == DAR_OK) s = dar_resize(path, own, im.width, im.height, rgb, width, height, e);
+    if (s == DAR_OK && im.width == width && im.height == height) {
+        memcpy(rgb, own, 3 * width * height);
+    } else if (s == DAR_OK) {
+        s = dar_resize(path, own, im.width, im.height, rgb, width, height, e);
+        *other = true;
+    }
     free(own);
     dar_file_map_close(&m);
     return s;
@@ -65,12 +73,13 @@ static dar_status load(const char *path, size_t width, size_t height, bool any, 
 
 dar_status dar_pictures_load(const char *path, size_t width, size_t height, uint8_t *rgb, dar_err *e)
 {
-    return load(path, width, height, false, rgb, e);
+    return load(path, width, height, NULL, rgb, e);
 }
 
 dar_status dar_pictures_fit(const char *path, size_t width, size_t height, uint8_t *rgb, dar_err *e)
 {
-    return load(path, width, height, true, rgb, e);
+    bool other;
+    return load(path, width, height, &other, rgb, e);
 }
 
 /* ---------------------------------------------------------------- many */
@@ -91,6 +100,8 @@ static dar_status open_directory(dar_pictures *p, dar_err *e)
 {
     p->files = scandir(p->path, &p->file, is_picture, in_order);
     if (p->files < 0) return dar_fail(e, DAR_ERR_IO, "%s: %s", p->path, strerror(errno));
+    if (p->any) p->frames = (size_t)p->files;
+    if (p->any && !p->files) return dar_fail(e, DAR_ERR_FORMAT, "%s: found no PNG and no JPEG file", p->path);
     if ((size_t)p->files == p->frames) return DAR_OK;
     return dar_fail(e, DAR_ERR_FORMAT, "%s: found %d PNG and JPEG files, expected %zu, one for each frame", p->path,
                     p->files, p->frames);
@@ -98,22 +109,28 @@ static dar_status open_directory(dar_pictures *p, dar_err *e)
 
 static dar_status open_video(dar_pictures *p, dar_err *e)
 {
-    dar_video_info info;
-    DAR_TRY(dar_video_open(&p->video, &info, p->path, e));
-    DAR_TRY(check_size(p->path, info.width, info.height, p->width, p->height, e));
-    if (info.frames == p->frames) return DAR_OK;
-    return dar_fail(e, DAR_ERR_FORMAT, "%s: found %zu frames, expected %zu", p->path, info.frames, p->frames);
+    dar_video_info *i = &p->info;
+    DAR_TRY(dar_video_open(&p->video, i, p->path, e));
+    if (p->any) {
+        p->frames = i->frames;
+        p->resized = i->width != p->width || i->height != p->height;
+        if (p->resized && !(p->own = malloc(3 * i->width * i->height)))
+            return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", p->path);
+        return i->frames ? DAR_OK : dar_fail(e, DAR_ERR_FORMAT, "%s: found no frame", p->path);
+    }
+    DAR_TRY(check_size(p->path, i->width, i->height, p->width, p->height, e));
+    if (i->frames == p->frames) return DAR_OK;
+    return dar_fail(e, DAR_ERR_FORMAT, "%s: found %zu frames, expected %zu", p->path, i->frames, p->frames);
 }
 
-dar_status dar_pictures_open(dar_pictures **out, const char *path, size_t width, size_t height, size_t frames,
-                             dar_err *e)
+static dar_status open_all(dar_pictures **out, const dar_pictures *asked, dar_err *e)
 {
     struct stat st;
-    dar_pictures *p = *out = calloc(1, sizeof *p);
+    dar_pictures *p = *out = malloc(sizeof *p);
     dar_status s = DAR_OK;
-    if (!p) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", path);
-    *p = (dar_pictures){ .path = path, .width = width, .height = height, .frames = frames };
-    if (stat(path, &st) != 0) s = dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
+    if (!p) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", asked->path);
+    *p = *asked;
+    if (stat(p->path, &st) != 0) s = dar_fail(e, DAR_ERR_IO, "%s: %s", p->path, strerror(errno));
     else s = S_ISDIR(st.st_mode) ? open_directory(p, e) : open_video(p, e);
     if (s != DAR_OK) {
         dar_pictures_close(p);
@@ -122,13 +139,40 @@ dar_status dar_pictures_open(dar_pictures **out, const char *path, size_t width,
     return s;
 }
 
+dar_status dar_pictures_open(dar_pictures **out, const char *path, size_t width, size_t height, size_t frames,
+                             dar_err *e)
+{
+    return open_all(out, &(dar_pictures){ .path = path, .width = width, .height = height, .frames = frames }, e);
+}
+
+dar_status dar_pictures_open_any(dar_pictures **out, const char *path, size_t width, size_t height, size_t *frames,
+                                 dar_err *e)
+{
+    DAR_TRY(open_all(out, &(dar_pictures){ .path = path, .width = width, .height = height, .any = true }, e));
+    *frames = (*out)->frames;
+    return DAR_OK;
+}
+
+bool dar_pictures_resized(const dar_pictures *p)
+{
+    return p->resized;
+}
+
 void dar_pictures_close(dar_pictures *p)
 {
     if (!p) return;
     dar_video_close(p->video);
     for (int i = 0; i < p->files; i++) free(p->file[i]);
     free(p->file);
+    free(p->own);
     free(p);
+}
+
+static dar_status read_video(dar_pictures *p, uint8_t *rgb, dar_err *e)
+{
+    if (!p->own) return dar_video_read(p->video, rgb, e);
+    DAR_TRY(dar_video_read(p->video, p->own, e));
+    return dar_resize(p->path, p->own, p->info.width, p->info.height, rgb, p->width, p->height, e);
 }
 
 dar_status dar_pictures_read(dar_pictures *p, uint8_t *rgb, dar_err *e)
@@ -136,8 +180,8 @@ dar_status dar_pictures_read(dar_pictures *p, uint8_t *rgb, dar_err *e)
     char path[PATH_MAX];
     DAR_ASSERT(p->next < p->frames, "pictures: more than %zu asked for", p->frames);
     size_t i = p->next++;
-    if (p->video) return dar_video_read(p->video, rgb, e);
+    if (p->video) return read_video(p, rgb, e);
     if (snprintf(path, sizeof path, "%s/%s", p->path, p->file[i]->d_name) >= (int)sizeof path)
         return dar_fail(e, DAR_ERR_IO, "%s: %s", p->path, strerror(ENAMETOOLONG));
-    return dar_pictures_load(path, p->width, p->height, rgb, e);
+    return load(path, p->width, p->height, p->any ? &p->resized : NULL, rgb, e);
 }

@@ -5,6 +5,7 @@
 #ifndef DAR_DATA_PICTURES_H
 #define DAR_DATA_PICTURES_H
 
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
@@ -17,6 +18,13 @@ typedef struct dar_pictures dar_pictures;
 dar_status dar_pictures_open(dar_pictures **out, const char *path, size_t width, size_t height, size_t frames,
                              dar_err *e);
 void dar_pictures_close(dar_pictures *p); /* accepts NULL */
+
+/* The same with as many as there are, which *frames tells, of any size: brought to this one (data/resize.h). */
+dar_status dar_pictures_open_any(dar_pictures **out, const char *path, size_t width, size_t height, size_t *frames,
+                                 dar_err *e);
+
+/* Whether some picture was brought to another size so far. */
+bool dar_pictures_resized(const dar_pictures *p);
 
 /* The next one.  At most as many as there are. */
 dar_status dar_pictures_read(dar_pictures *p, uint8_t *rgb, dar_err *e);

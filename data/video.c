@@ -6,6 +6,7 @@
 #include <math.h>
 #include <signal.h>
 #include <spawn.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -157,9 +158,15 @@ static const struct {
     const char *format, *codec, *pixels, *key, *value;
 } codecs[DAR_VIDEO_CODECS] = {
     [DAR_VIDEO_H264] = { "mp4", "libx264", "yuv420p", "-crf", "18" },
+    [DAR_VIDEO_SMALL] = { "mp4", "libx264", "yuv420p", "-crf", "30" },
     [DAR_VIDEO_FFV1] = { "matroska", "ffv1", "bgr0", "-level", "3" },
     [DAR_VIDEO_X264RGB] = { "matroska", "libx264rgb", "rgb24", "-qp", "0" },
 };
+
+static bool for_people(dar_video_codec codec)
+{
+    return codec == DAR_VIDEO_H264 || codec == DAR_VIDEO_SMALL;
+}
 
 /* `name=value`, or NULL if there is none; on the heap. */
 static dar_status tag(char **out, const char *path, const char *name, const char *value, dar_err *e)
@@ -211,7 +218,7 @@ static dar_status encode(dar_video *v, size_t width, size_t height, const dar_vi
     DAR_TRY(tag(&comment, v->path, "comment", how->comment, e));
     snprintf(size, sizeof size, "%zux%zu", width, height);
     snprintf(rate, sizeof rate, "%.6f", how->fps);
-    for (size_t i = 0; i < DAR_COUNT(colour) && codec == DAR_VIDEO_H264; i++) argv[n++] = colour[i];
+    for (size_t i = 0; i < DAR_COUNT(colour) && for_people(codec); i++) argv[n++] = colour[i];
     if (comment) {
         argv[n++] = "-metadata";
         argv[n++] = comment;
@@ -233,7 +240,7 @@ dar_status dar_video_create(dar_video **out, const char *path, size_t width, siz
                width, height);
     DAR_ASSERT(how->fps > 0 && how->fps <= 1000, "%s: %g frames per second", path, how->fps);
     *out = NULL;
-    if (how->codec == DAR_VIDEO_H264 && (width | height) & 1)
+    if (for_people(how->codec) && (width | height) & 1)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found %zux%zu, expected even sides for yuv420p", path, width, height);
     dar_status s = allocate(out, path, e);
     if (s == DAR_OK) s = dar_file_create(&(*out)->out, path, e);

@@ -15,6 +15,7 @@
 
 typedef enum dar_video_codec {
     DAR_VIDEO_H264,    /* .mp4, yuv420p, bt709, crf 18: for people; even sides only */
+    DAR_VIDEO_SMALL,   /* the same with crf 30, for pages that hold many */
     DAR_VIDEO_FFV1,    /* .mkv, exact */
     DAR_VIDEO_X264RGB, /* .mkv, exact */
     DAR_VIDEO_CODECS
