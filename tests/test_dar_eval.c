@@ -1,0 +1,304 @@
+/* test_dar_eval.c: the program dar-eval: two small synthetic bundles, methods made of their own pictures, whose answers
+ * are known. */
+#include "tests/run.h"
+
+#include "data/bundle.h"
+#include "data/png.h"
+#include "data/uri.h"
+#include "lib/json.h"
+
+#define W 64
+#define H 48
+#define T 11
+
+enum { VALUES = 3 * W * H };
+
+static char dir[] = "/tmp/dar-eval-XXXXXX", program[PATH_MAX], bundler[PATH_MAX], weights[3][PATH_MAX];
+static const char *const clip[] = { "000000", "000001" };
+
+#define RUN(...) RUN_PROGRAM(program, __VA_ARGS__)
+
+/* ---------------------------------------------------------------- methods */
+
+typedef void change_fn(uint8_t *rgb, size_t t);
+
+static void keep(uint8_t *rgb, size_t t)
+{
+    (void)rgb, (void)t;
+}
+
+/* Every value is off by 5. */
+static void offset(uint8_t *rgb, size_t t)
+{
+    (void)t;
+    for (size_t i = 0; i < VALUES; i++) rgb[i] = (uint8_t)(rgb[i] >= 5 ? rgb[i] - 5 : rgb[i] + 5);
+}
+
+static void write_frame(const char *method, size_t c, size_t number, const uint8_t *rgb)
+{
+    char path[256];
+    dar_err e;
+    mkdir(method, 0777);
+    snprintf(path, sizeof path, "%s/%s", method, clip[c]);
+    mkdir(path, 0777);
+    snprintf(path, sizeof path, "%s/%s/%zu.png", method, clip[c], number);
+    CHECK(dar_png_write(path, W, H, 3, rgb, &e) == DAR_OK, "%s", e.text);
+}
+
+/* Frames of the clip, changed, numbered in steps of `step`; what lies between is noise. */
+static void make_method(const char *method, size_t clips, change_fn *change, size_t step)
+{
+    static uint8_t rgb[VALUES], noise[VALUES];
+    for (size_t i = 0; i < VALUES; i++) noise[i] = (uint8_t)(i * 37);
+    for (size_t c = 0; c < clips; c++) {
+        char path[64];
+        dar_bundle *b;
+        dar_err e;
+        snprintf(path, sizeof path, "set/%s", clip[c]);
+        CHECK(dar_bundle_open(&b, path, &e) == DAR_OK, "%s", e.text);
+        for (size_t t = 0; t < T; t++) {
+            CHECK(dar_bundle_rgb(b, t, rgb, &e) == DAR_OK, "%s", e.text);
+            change(rgb, t);
+            write_frame(method, c, step * t, rgb);
+            for (size_t k = 1; k < step && t + 1 < T; k++) write_frame(method, c, step * t + k, noise);
+        }
+        dar_bundle_close(b);
+    }
+}
+
+static int make_all(void **state)
+{
+    (void)state;
+    for (int i = 0; i < 3; i++) {
+        static const char *const name[] = { "alex", "alex_lin", "vgg" };
+        char path[64];
+        snprintf(path, sizeof path, "tests/fixtures/lpips_%s.safetensors", name[i]);
+        if (!realpath(path, weights[i])) return -1;
+    }
+    if (!mkdtemp(dir) || chdir(dir) != 0) return -1;
+    RUN_PROGRAM(bundler, "synth", "--set", "4d_vis", "--count", "2", "--size", "64x48", "--frames", "11", "-o", "set");
+    CHECK(ran.status == 0, "%s", ran.err);
+    make_method("same", 2, keep, 1);
+    make_method("offset", 2, offset, 1);
+    make_method("double", 2, keep, 2);
+    make_method("half", 1, keep, 1);
+    return 0;
+}
+
+static int remove_all(void **state)
+{
+    (void)state;
+    return chdir("/") == 0 ? run_remove(dir) : -1;
+}
+
+/* ---------------------------------------------------------------- results */
+
+static dar_json_doc *doc;
+
+static void open_results(const char *out)
+{
+    char path[128];
+    dar_err e;
+    snprintf(path, sizeof path, "%s/metrics.json", out);
+    CHECK(dar_json_open(&doc, path, &e) == DAR_OK, "%s", e.text);
+}
+
+static dar_json method_of(const char *name)
+{
+    dar_json j = dar_json_first(dar_json_get(dar_json_root(doc), "methods"));
+    while (j.item && strcmp(dar_json_text(j, "name", ""), name) != 0) j = dar_json_next(j);
+    CHECK(j.item, "no method %s", name);
+    return j;
+}
+
+/* Mean over all clips and frames. */
+static dar_json measure_of(const char *name, const char *measure)
+{
+    dar_json j = dar_json_get(dar_json_get(method_of(name), "sets"), "4d_vis");
+    return dar_json_get(dar_json_get(dar_json_get(j, "all"), "frame"), measure);
+}
+
+static double mean_of(const char *name, const char *measure)
+{
+    return dar_json_number(measure_of(name, measure), "mean", NAN, -1e9, 1e9);
+}
+
+static char *text_of(const char *path)
+{
+    static dar_file_map m;
+    static char *text;
+    dar_err e;
+    free(text);
+    CHECK(dar_file_map_open(&m, path, &e) == DAR_OK, "%s", e.text);
+    assert_non_null(text = malloc(m.size + 1));
+    memcpy(text, m.data, m.size);
+    text[m.size] = 0;
+    dar_file_map_close(&m);
+    return text;
+}
+
+/* ---------------------------------------------------------------- tests */
+
+static void test_known(void **state)
+{
+    (void)state;
+    GOOD("same", "offset", "--against", "set", "-o", "known", "--no-report", "--lpips", weights[0], weights[1],
+         weights[2]);
+    open_results("known");
+    CHECK_NEAR("psnr of the same", mean_of("same", "psnr"), 100, 0);
+    CHECK_NEAR("ssim of the same", mean_of("same", "ssim"), 1, 1e-12);
+    CHECK_NEAR("flip of the same", mean_of("same", "flip"), 0, 0);
+    CHECK_NEAR("lpips of the same", mean_of("same", "lpips_alex"), 0, 0);
+    CHECK_NEAR("lpips of the same", mean_of("same", "lpips_vgg"), 0, 0);
+    CHECK_NEAR("motion of the same", mean_of("same", "templ1_truth"), 0, 0);
+    CHECK_NEAR("psnr of 5 too many", mean_of("offset", "psnr"), 20 * log10(51), 1e-10);
+    CHECK(mean_of("offset", "lpips_alex") > 0 && mean_of("offset", "flip") > 0, "the offset is not seen");
+    CHECK_NEAR("refl1 of frame 0", mean_of("repeat frame 0", "refl1"), 0, 0);
+    CHECK_NEAR("motion of frame 0", mean_of("repeat frame 0", "templ1"), 0, 0);
+    CHECK(mean_of("oracle warp", "psnr") > mean_of("repeat frame 0", "psnr"), "the oracle is no better than frame 0");
+    dar_json_close(doc);
+}
+
+/* Names 0.png to 10.png are in the order of numbers; frame 2 t of twice as many is frame t. */
+static void test_time(void **state)
+{
+    (void)state;
+    BAD(2, "found 21 frames, expected 11", "double", "--against", "set", "-o", "wrong", "--quiet");
+    assert_false(run_is_there("wrong"));
+    GOOD("double", "same", "--against", "set", "-o", "time", "--no-report", "--align", "normalized-time");
+    open_results("time");
+    CHECK_NEAR("psnr", mean_of("double", "psnr"), 100, 0);
+    assert_true(dar_json_bool(method_of("double"), "external", false));
+    assert_false(dar_json_bool(method_of("same"), "external", true));
+    dar_json_close(doc);
+}
+
+static void test_size(void **state)
+{
+    static uint8_t grey[3 * 32 * 24];
+    dar_err e;
+    (void)state;
+    memset(grey, 128, sizeof grey);
+    mkdir("small", 0777);
+    mkdir("small/000000", 0777);
+    assert_int_equal(dar_png_write("small/000000/0.png", 32, 24, 3, grey, &e), DAR_OK);
+    GOOD("small", "--against", "set/000000", "-o", "size", "--no-report", "--align", "normalized-time");
+    char *text = text_of("size/tables.md");
+    CHECK(strstr(text, "one clip gives no interval"), "%s", text);
+    CHECK(strstr(text, "small †"), "%s", text);
+    mkdir("tall", 0777);
+    mkdir("tall/000000", 0777);
+    for (int t = 0; t < T; t++) {
+        char path[64];
+        snprintf(path, sizeof path, "tall/000000/%d.png", t);
+        assert_int_equal(dar_png_write(path, 24, 32, 3, grey, &e), DAR_OK);
+    }
+    BAD(2, "found another size than 64 x 48", "tall", "--against", "set/000000", "-o", "wrong", "--quiet");
+}
+
+static void test_missing_clips(void **state)
+{
+    (void)state;
+    GOOD("same", "half", "--against", "set", "-o", "half-out", "--no-report");
+    CHECK(strstr(ran.err, "half: found 1 of 2 clips"), "%s", ran.err);
+    CHECK(strstr(text_of("half-out/tables.md"), "| half | 1/2 |"), "no 1/2");
+    open_results("half-out");
+    CHECK(dar_json_get(measure_of("same", "psnr"), "lo").item, "two clips have no interval");
+    CHECK(!dar_json_get(measure_of("half", "psnr"), "lo").item, "one clip has an interval");
+    dar_json_close(doc);
+}
+
+static void test_refused(void **state)
+{
+    (void)state;
+    mkdir("empty", 0777);
+    BAD(2, "expected --against", "same", "-o", "wrong");
+    BAD(2, "expected -o DIR", "same", "--against", "set");
+    BAD(2, "found pictures of no clip", "empty", "--against", "set", "-o", "wrong", "--quiet");
+    BAD(2, "a second method 'same'", "same", "./same/", "--against", "set", "-o", "wrong");
+    BAD(2, "--base: found 'other'", "same", "--against", "set", "-o", "wrong", "--base", "other");
+    BAD(2, "found no bundle", "same", "--against", "same", "-o", "wrong");
+    BAD(2, "found no trunk", "same", "--against", "set", "-o", "wrong", "--lpips", weights[1]);
+    BAD(2, "set: is there already", "same", "--against", "set", "-o", "set");
+    assert_false(run_is_there("wrong"));
+}
+
+static void test_names(void **state)
+{
+    (void)state;
+    GOOD("dar@2000=same", "tracking+normal+depth@2000=offset", "--against", "set", "-o", "names", "--no-report");
+    char *text = text_of("names/tables.md");
+    CHECK(strstr(text, "World position against depth"), "%s", text);
+    text = text_of("names/table.csv");
+    CHECK(strncmp(text,
+                  "set,mode,seed,step,split,trajectory,clips,psnr,psnr_lo,psnr_hi,ssim,lpips,flip,templ1,refl1\n"
+                  "tracking+world+normal,,,2000,4d_vis,all,2,100,100,100,1,,0,",
+                  148) == 0,
+          "%s", text);
+}
+
+static void test_threads(void **state)
+{
+    (void)state;
+    GOOD("offset", "--against", "set", "-o", "t1", "--no-report", "--threads", "1");
+    GOOD("offset", "--against", "set", "-o", "t3", "--no-report", "--threads", "3");
+    run_same_file("t1/metrics.json", "t3/metrics.json");
+    run_same_file("t1/frames.csv", "t3/frames.csv");
+}
+
+/* ---------------------------------------------------------------- the report */
+
+/* Whether the page has id="NAME", NAME up to a quote. */
+static bool has_id(const char *page, const char *name)
+{
+    char id[80];
+    size_t n = strcspn(name, "\"");
+    snprintf(id, sizeof id, "id=\"%.*s\"", (int)(n < 64 ? n : 64), name);
+    return strstr(page, id) != NULL;
+}
+
+/* The base64 of the element with this id is a video. */
+static void check_film(const char *page, const char *name)
+{
+    char id[80], *uri;
+    unsigned char *data;
+    size_t size, length;
+    snprintf(id, sizeof id, "<script type=\"text/plain\" id=\"%.*s\">", (int)strcspn(name, "\""), name);
+    const char *at = strstr(page, id);
+    CHECK(at, "no %s", id);
+    at += strlen(id);
+    length = strcspn(at, "<");
+    assert_non_null(uri = malloc(length + 64));
+    assert_non_null(data = malloc(length + 64));
+    snprintf(uri, length + 64, "data:video/mp4;base64,%.*s", (int)length, at);
+    const char *wrong = dar_uri_decode(uri, data, &size);
+    CHECK(!wrong && size > 100 && memcmp(data + 4, "ftyp", 4) == 0, "%s is no video", id);
+    free(data);
+    free(uri);
+}
+
+static void test_report(void **state)
+{
+    size_t links = 0, films = 0;
+    (void)state;
+    GOOD("same", "a<b>&c=offset", "--against", "set", "-o", "page", "--masked");
+    const char *page = text_of("page/report.html");
+    CHECK(!strstr(page, "href=\"http") && !strstr(page, "url(") && !strstr(page, " src="), "something from elsewhere");
+    CHECK(strstr(page, "a&lt;b&gt;&amp;c") && !strstr(page, "<b>&c"), "a name is read as HTML");
+    for (const char *p = page; (p = strstr(p, "href=\"#")); links++)
+        CHECK(has_id(page, p += 7), "%.40s leads nowhere", p);
+    for (const char *p = page; (p = strstr(p, "data-film=\"")); films++) check_film(page, p += 11);
+    CHECK(links >= 6 && films == 4, "%zu links, %zu films", links, films);
+}
+
+int main(int argc, char **argv)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_known),         cmocka_unit_test(test_time),    cmocka_unit_test(test_size),
+        cmocka_unit_test(test_missing_clips), cmocka_unit_test(test_refused), cmocka_unit_test(test_names),
+        cmocka_unit_test(test_threads),       cmocka_unit_test(test_report),
+    };
+    (void)argc;
+    if (!run_find(program, argv[0], "dar-eval") || !run_find(bundler, argv[0], "dar-bundle")) return 1;
+    return cmocka_run_group_tests(tests, make_all, remove_all) != 0;
+}
