@@ -1,10 +1,11 @@
 /* bench_net.c: rows of whole blocks of the transformer (models/dit.h): inference, and a training step of rank-32 LoRA
  * (forward, loss, backward; only what is cheap is computed again).  Keys and values of the text are made each time. */
-#include "tests/bench.h"
+#include <string.h>
 
 #include "lib/status.h"
 #include "models/dit.h"
 #include "models/lora.h"
+#include "tests/bench.h"
 
 #define RANK 32
 
@@ -79,8 +80,13 @@ static void make(bench *b, struct network *n, int64_t rank, const struct network
     dar_dit_init(&n->m, &n->p, &c, &(dar_adapter_config){ .unshuffle = 1 });
     dar_lora_init(&n->m, &n->p, &(dar_lora_config){ .rank = rank, .alpha = 1, .targets = DAR_PROJECTIONS_ALL });
     dar_params_train(&n->p, DAR_PARAM_LORA);
-    for (size_t i = 0; share && i < n->p.count; i++) dar_param_bind(&n->p, n->p.at[i], &share->p.at[i]->x);
-    dar_params_fresh(&n->p, DAR_PARAM_ALL, 1);
+    for (size_t i = 0; share && i < n->p.count; i++)
+        if (share->p.at[i]->x.data) dar_param_bind(&n->p, n->p.at[i], &share->p.at[i]->x);
+    for (size_t i = 0; i < n->p.count; i++) { /* what runs: not time, head, patches */
+        dar_param *q = n->p.at[i];
+        if (q->info.role == DAR_PARAM_LORA || !strncmp(q->name, "blocks.", 7) || !strncmp(q->name, "text_", 5))
+            dar_param_fresh(&n->p, q, 1);
+    }
     dar_params_gradients(&n->p);
     n->m.replay = DAR_REPLAY_CHEAP;
 }
