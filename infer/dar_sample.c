@@ -55,8 +55,8 @@ static const dar_option options[] = {
       .help = "control adapter, instead of the transformer's own" },
     { .name = "taew", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_TAEW],
       .help = "tiny decoder, for --preview: safetensors or .pth" },
-    { .name = "lora", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_LORA],
-      .help = "low-rank additions" },
+    { .name = "lora", .placeholder = "FILE|DIR", .type = DAR_ARG_TEXT, .target = &o.part[DAR_MODEL_LORA],
+      .help = "low-rank additions; of a directory that dar-train wrote, with the adapter beside them" },
     { .name = "lora-strength", .placeholder = "S", .type = DAR_ARG_NUMBER, .target = &o.strength, .standard = "1",
       .lo = -100, .hi = 100, .help = "how strongly they count; 1: as trained" },
     { .name = "channels", .placeholder = "SET", .type = DAR_ARG_TEXT, .target = &o.channels,
@@ -190,11 +190,27 @@ static dar_dtype storage(void)
     return o.precision == EIGHT ? DAR_BF16 : (dar_dtype)o.precision;
 }
 
+/* --lora DIR: its lora.safetensors, and the adapter that was trained with it, if no other is named. */
+static void find_trained(const char *part[DAR_MODEL_PARTS])
+{
+    static char path[2][PATH_MAX];
+    static const dar_model_part parts[] = { DAR_MODEL_LORA, DAR_MODEL_ADAPTER };
+    const char *directory = part[DAR_MODEL_LORA];
+    struct stat st;
+    if (!directory || stat(directory, &st) != 0 || !S_ISDIR(st.st_mode)) return;
+    for (int i = 0; i < 2; i++) {
+        int n = snprintf(path[i], PATH_MAX, "%s/%s.safetensors", directory, dar_model_part_name[parts[i]]);
+        bool there = n < PATH_MAX && stat(path[i], &st) == 0;
+        if (i == 0 || (there && !part[parts[i]])) part[parts[i]] = path[i];
+    }
+}
+
 static dar_status open_model(struct job *j, dar_err *e)
 {
     dar_model_options m = { .weights = o.weights, .strength = o.strength, .plan = o.common.dry_run };
     dar_model_file f;
     memcpy(m.part, o.part, sizeof m.part);
+    find_trained(m.part);
     m.storage = storage();
     m.eight = o.precision == EIGHT;
     m.random = o.random, m.seed = o.common.seed;

@@ -258,7 +258,10 @@ static void batches(void **state)
     (void)state;
     GOOD("clip", "seen", "-o", "all", MODEL, "--reference", "a.png", "b.png", "--json");
     CHECK_NEAR("done", printed("done"), 4, 0);
-    GOOD("clip", "-o", "alone", MODEL, "--reference", "b.png");
+    double prepared = printed_in("flops", "prepare"), steps = printed_in("flops", "sample");
+    GOOD("clip", "-o", "alone", MODEL, "--reference", "b.png", "--json");
+    CHECK_NEAR("preparing for one or two", printed_in("flops", "prepare"), prepared, 0);
+    CHECK_NEAR("sampling one", printed_in("flops", "sample"), steps, 0);
     same_files("all/clip-b", "alone");
     run_same_file("all/clip-b/sample.json", "alone/sample.json");
     assert_true(frames_differ("all/clip-a", "all/clip-b"));
@@ -473,6 +476,11 @@ static void precisions(void **state)
     printf("note: int8 against bf16, latent of two blocks after two steps: %.1e\n", off);
     CHECK(off > 1e-6, "nothing is rounded");
     CHECK_NEAR("int8", off, 0, 0.05);
+
+    /* What was trained, as a directory: the adapter of this one is the model's own. */
+    assert_int_equal(mkdir("trained", 0777), 0);
+    assert_int_equal(symlink("../model/dit.safetensors", "trained/adapter.safetensors"), 0);
+    BAD(2, "trained/lora.safetensors: No such", "clip", "-o", "x", MODEL, "--reference", "a.png", "--lora", "trained");
 
     assert_int_equal(mkdir("bare", 0777), 0);
     run_write("bare/model.json", model, sizeof model - 1);
