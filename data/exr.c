@@ -112,6 +112,20 @@ static dar_status refused(const char *path, const struct stream *s, exr_result_t
 
 /* ---------------------------------------------------------------- writing */
 
+/* In pieces: ffmpeg 5 loses its way in a header with a longer text. */
+static exr_result_t set_comment(exr_context_t ctx, int part, const char *comment)
+{
+    exr_result_t r = EXR_ERR_SUCCESS;
+    char name[32] = "comments", piece[256];
+    for (int i = 2; r == EXR_ERR_SUCCESS && *comment; i++) {
+        snprintf(piece, sizeof piece, "%s", comment);
+        r = exr_attr_set_string(ctx, part, name, piece);
+        comment += strlen(piece);
+        snprintf(name, sizeof name, "comments%d", i);
+    }
+    return r;
+}
+
 static exr_result_t define(exr_context_t ctx, size_t width, size_t height, const dar_exr_plane *plane, size_t planes,
                            const dar_exr_how *how)
 {
@@ -121,7 +135,7 @@ static exr_result_t define(exr_context_t ctx, size_t width, size_t height, const
     exr_result_t r = exr_add_part(ctx, NULL, EXR_STORAGE_SCANLINE, &part);
     if (r == EXR_ERR_SUCCESS)
         r = exr_initialize_required_attr_simple(ctx, part, (int)width, (int)height, code[how->compression]);
-    if (r == EXR_ERR_SUCCESS && how->comment) r = exr_attr_set_string(ctx, part, "comments", how->comment);
+    if (r == EXR_ERR_SUCCESS && how->comment) r = set_comment(ctx, part, how->comment);
     for (size_t i = 0; i < planes && r == EXR_ERR_SUCCESS; i++)
         r = exr_add_channel(ctx, part, plane[i].name, type[plane[i].type], EXR_PERCEPTUALLY_LOGARITHMIC, 1, 1);
     return r == EXR_ERR_SUCCESS ? exr_write_header(ctx) : r;

@@ -26,7 +26,7 @@ typedef struct dar_exr_plane {
 
 typedef struct dar_exr_how {
     dar_exr_compression compression;
-    const char *comment; /* attribute "comments"; NULL: none */
+    const char *comment; /* attributes "comments", "comments2", ... of at most 255 bytes each; NULL: none */
 } dar_exr_how;
 
 /* Replace the file in one moment.  Names must differ. */

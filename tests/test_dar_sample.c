@@ -539,6 +539,8 @@ static void layers(void **state)
         snprintf(path, sizeof path, "comp/%s", files[i]);
         CHECK(holds(path, "\"made_by\": \"dar-sample"), "%s does not tell how it was made", path);
     }
+    dar_video_info info;
+    CHECK(dar_video_probe(&info, "comp/exr/00004.exr", &e) == DAR_OK && info.width == W, "%s", e.text);
     dar_srgb_init(&srgb);
     assert_int_equal(dar_pictures_load("comp/frames/00004.png", W, H, rgb, &e), DAR_OK);
     assert_int_equal(dar_bundle_open(&b, "clip", &e), DAR_OK);
