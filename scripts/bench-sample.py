@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""bench-sample.py [BUNDLE]: sampling at the sizes of dar-tiny side by side with PyTorch on this processor.
+"""bench-sample.py [f32] [bf16]: sampling at the sizes of dar-tiny side by side with PyTorch on this processor.
 
     pip install torch==2.13.0
     make
@@ -8,8 +8,8 @@ The same work: every call of the network with adapter, text and times, nothing k
 in PyTorch as the public code calls it: adapter in every call, a time for every token, 16 text tokens, both prompts in
 one batch or one after the other, eager and compiled, whichever is quickest.  Then a clip with two different prompts, as
 a program does it here, all exact skips and preparation of the clip included, against those calls.  Weights are drawn.
-Prints medians and ratios as a Markdown table.  BUNDLE: 128 x 224, 17 frames, made from ../shared/assets/robot.glb if
-not given.
+Prints medians and ratios as a Markdown table.  The bundle is made from ../shared/assets/robot.glb: 17 frames of
+224 x 128.
 """
 import json
 import os
@@ -147,7 +147,7 @@ def main():
         print(json.dumps(torch_case(*json.loads(sys.argv[2]))))
         return
     os.makedirs(OUT, exist_ok=True)
-    bundle = sys.argv[1] if len(sys.argv) > 1 else f"{OUT}/robot"
+    bundle = f"{OUT}/robot"
     if not os.path.exists(bundle):
         subprocess.run(["build/release/dar-bundle", "render", "../shared/assets/robot.glb", "-o", bundle, "--size",
                         "224x128", "--frames", "17", "--trajectory", "orbit-60", "--shade", "day", "--quiet"],
@@ -156,7 +156,7 @@ def main():
     print(f"| type | here, call [ms] | PyTorch, call: eager, compiled [ms] | ratio | here, clip of {STEPS} steps [s] | "
           "PyTorch [s] | ratio |")
     print("|---|---|---|---|---|---|---|")
-    for dtype in ("f32", "bf16"):
+    for dtype in sys.argv[1:] or ("f32", "bf16"):
         _, plain = run_ours(bundle, dtype, "none")
         prepare, steps = run_ours(bundle, dtype, "exact")
         eager, fused = (min(run_torch(dtype, compiled, batched) for batched in (False, True))
