@@ -24,6 +24,9 @@ void dar_kern_init(unsigned cpu_flags)
         dar_kern_move_ref(k);
         if (cpu_flags & DAR_CPU_AVX2) dar_kern_move_avx2(k);
         if (cpu_flags & DAR_CPU_AVX512) dar_kern_move_avx512(k);
+        dar_kern_random_ref(k);
+        if (cpu_flags & DAR_CPU_AVX2) dar_kern_random_avx2(k);
+        if (cpu_flags & DAR_CPU_AVX512) dar_kern_random_avx512(k);
     }
 }
 
@@ -120,15 +123,25 @@ float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q)
 struct adamw {
     const dar_adamw *a;
     dar_dtype c, moments;
-    char *w, *m, *v;
-    const char *g;
+    char *w, *m, *v, *g;
 };
+
+/* n moments x of f32 as bf16, rounded by one half of as many random numbers. */
+static void put_moments(const struct adamw *p, size_t i, size_t n, const float *m, const float *v)
+{
+    const dar_kern *k = dar_kern_for(DAR_F32);
+    uint32_t random[DAR_PIECE];
+    k->philox((n + 3) / 4, p->a->seed, p->a->stream, p->a->index / 4 + i / 4, random);
+    k->dither(n, random, 0, m, (uint16_t *)(void *)p->m + i);
+    k->dither(n, random, 1, v, (uint16_t *)(void *)p->v + i);
+}
 
 static void adamw_range(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct adamw *p = ctx;
     const dar_kern *k = dar_kern_for(p->c);
     size_t size = dar_dtype_size(p->c), stored = dar_dtype_size(p->moments);
+    bool random = p->c == DAR_F32 && p->moments == DAR_BF16;
     double mbuf[DAR_PIECE], vbuf[DAR_PIECE];
     (void)thread;
     for (size_t i = begin; i < end; i += DAR_PIECE) {
@@ -139,15 +152,20 @@ static void adamw_range(void *ctx, size_t begin, size_t end, int thread)
         dar_row_get(p->c, p->moments, m_at, n, m);
         dar_row_get(p->c, p->moments, v_at, n, v);
         k->adamw(n, p->a, p->w + i * size, m, v, p->g + i * size);
+        memset(p->g + i * size, 0, n * size);
+        if (random) {
+            put_moments(p, i, n, m, v);
+            continue;
+        }
         dar_row_put(p->c, m, p->moments, m_at, n, DAR_PUT);
         dar_row_put(p->c, v, p->moments, v_at, n, DAR_PUT);
     }
 }
 
-void dar_row_adamw(const dar_adamw *a, dar_dtype c, dar_dtype moments, size_t n, void *w, void *m, void *v,
-                   const void *g)
+void dar_row_adamw(const dar_adamw *a, dar_dtype c, dar_dtype moments, size_t n, void *w, void *m, void *v, void *g)
 {
     struct adamw p = { a, c, moments, w, m, v, g };
+    DAR_ASSERT(a->index % 4 == 0, "adamw: random numbers from %llu on", (unsigned long long)a->index);
     dar_parallel_range(n, 16 * DAR_PIECE, adamw_range, &p);
 }
 

@@ -40,6 +40,10 @@ typedef struct dar_norm {
  * t = 1, 2, ...; scale is that of gradient clipping, else 1.  Source: Loshchilov and Hutter 2019, algorithm 2. */
 typedef struct dar_adamw {
     double rate, beta1, beta2, eps, decay, fix1, fix2, scale;
+
+    /* Of dar_row_adamw with moments in bf16: those of element i are rounded by the halves of dar_rng_u32(seed, stream,
+     * index + i), the lower one for m; index is a multiple of 4. */
+    uint64_t seed, stream, index;
 } dar_adamw;
 
 /* A tile of sums of 8-bit products, rows ld apart, with the scales of its rows and columns. */
@@ -62,6 +66,12 @@ typedef struct dar_kern {
      * x[i ldx + j] for i < m, j < n.  stream: copy past the caches, at any alignment. */
     void (*transpose[DAR_DTYPES])(size_t m, size_t n, const void *x, size_t ldx, void *y, size_t ldy);
     void (*stream)(size_t bytes, const void *x, void *y);
+
+    /* Likewise the same in both.  philox: the four numbers of each block index, index + 1, ... (lib/rng.h).  dither: x
+     * as bf16, rounded away from zero with the odds of what is cut off, by the lower or upper `half` (0, 1) of
+     * random[i]; infinity and NaN stay. */
+    void (*philox)(size_t blocks, uint64_t seed, uint64_t stream, uint64_t index, uint32_t *out);
+    void (*dither)(size_t n, const uint32_t *random, int half, const float *x, uint16_t *y);
 
     /* From and to storage, by stored type (i8 is NULL).  To 16 bits: nearest even, NaN stays NaN.  stream: write past
      * the caches. */
@@ -184,10 +194,9 @@ float dar_row_scale(dar_dtype stored, const void *x, size_t n);
 /* Quantise n stored elements: q = x / scale, zeros where the scale is 0 or NaN.  Returns the scale. */
 float dar_row_quantise(dar_dtype stored, const void *x, size_t n, int8_t *q);
 
-/* A step of AdamW over n parameters w with gradients g of arithmetic type c; the moments m, v are stored as `moments`.
- * Runs on all threads. */
-void dar_row_adamw(const dar_adamw *a, dar_dtype c, dar_dtype moments, size_t n, void *w, void *m, void *v,
-                   const void *g);
+/* A step of AdamW over n parameters w with gradients g of arithmetic type c, which become 0; the moments m, v are
+ * stored as `moments`: c, or bf16, rounded at random where c is f32.  Runs on all threads. */
+void dar_row_adamw(const dar_adamw *a, dar_dtype c, dar_dtype moments, size_t n, void *w, void *m, void *v, void *g);
 
 /* Index of the first NaN or Inf of n elements, or -1.  Runs on all threads. */
 int64_t dar_row_nonfinite(dar_dtype t, const void *x, size_t n);

@@ -4,6 +4,8 @@
 #include <math.h>
 #include <string.h>
 
+#include "lib/kern_random.h"
+
 #define REAL    float
 #define FN(x)   x##f
 #define NAME(x) x##_f32
@@ -42,4 +44,25 @@ void dar_kern_move_ref(dar_kern *k)
     k->transpose[DAR_F32] = transpose_4;
     k->transpose[DAR_BF16] = k->transpose[DAR_F16] = transpose_2;
     k->stream = stream;
+}
+
+/* ---------------------------------------------------------------- random bits */
+
+static void philox(size_t blocks, uint64_t seed, uint64_t stream, uint64_t index, uint32_t *out)
+{
+    for (size_t i = 0; i < blocks; i++) {
+        dar_philox b = dar_philox_at(seed, stream, index + i);
+        memcpy(out + 4 * i, b.x, sizeof b.x);
+    }
+}
+
+static void dither(size_t n, const uint32_t *random, int half, const float *x, uint16_t *y)
+{
+    for (size_t i = 0; i < n; i++) y[i] = dar_dither(x[i], random[i] >> 16 * half);
+}
+
+void dar_kern_random_ref(dar_kern *k)
+{
+    k->philox = philox;
+    k->dither = dither;
 }

@@ -45,4 +45,8 @@ void dar_kern_move_ref(dar_kern *k); /* transpose and stream */
 void dar_kern_move_avx2(dar_kern *k);
 void dar_kern_move_avx512(dar_kern *k);
 
+void dar_kern_random_ref(dar_kern *k); /* philox and dither */
+void dar_kern_random_avx2(dar_kern *k);
+void dar_kern_random_avx512(dar_kern *k);
+
 #endif

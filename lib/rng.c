@@ -8,58 +8,39 @@
 #include <string.h>
 
 #include "lib/kern.h"
+#include "lib/kern_random.h"
 #include "lib/thread.h"
 
 #define CHUNK (64 * 1024) /* elements per task; even, as DAR_PIECE is */
 
 /* ---------------------------------------------------------------- bits */
 
-struct block {
-    uint32_t x[4];
-};
-
-static inline struct block block_at(uint64_t seed, uint64_t stream, uint64_t index)
-{
-    uint32_t c0 = (uint32_t)index, c1 = (uint32_t)(index >> 32), c2 = (uint32_t)stream, c3 = (uint32_t)(stream >> 32);
-    uint32_t k0 = (uint32_t)seed, k1 = (uint32_t)(seed >> 32);
-    for (int round = 0; round < 10; round++) {
-        uint64_t p = (uint64_t)c0 * 0xd2511f53u, q = (uint64_t)c2 * 0xcd9e8d57u;
-        c0 = (uint32_t)(q >> 32) ^ c1 ^ k0;
-        c1 = (uint32_t)q;
-        c2 = (uint32_t)(p >> 32) ^ c3 ^ k1;
-        c3 = (uint32_t)p;
-        k0 += 0x9e3779b9u;
-        k1 += 0xbb67ae85u;
-    }
-    return (struct block){ { c0, c1, c2, c3 } };
-}
-
 /* Half 0 or 1 of a block as 64 bits, and its upper 53 as an integer. */
-static inline uint64_t half(const struct block *b, int i)
+static inline uint64_t half(const dar_philox *b, int i)
 {
     return (uint64_t)b->x[2 * i + 1] << 32 | b->x[2 * i];
 }
 
-static inline int64_t half53(const struct block *b, int i)
+static inline int64_t half53(const dar_philox *b, int i)
 {
     return (int64_t)(half(b, i) >> 11);
 }
 
 void dar_rng_philox(const uint32_t counter[4], const uint32_t key[2], uint32_t out[4])
 {
-    struct block b = block_at((uint64_t)key[1] << 32 | key[0], (uint64_t)counter[3] << 32 | counter[2],
-                              (uint64_t)counter[1] << 32 | counter[0]);
+    dar_philox b = dar_philox_at((uint64_t)key[1] << 32 | key[0], (uint64_t)counter[3] << 32 | counter[2],
+                                 (uint64_t)counter[1] << 32 | counter[0]);
     memcpy(out, b.x, sizeof b.x);
 }
 
 uint32_t dar_rng_u32(uint64_t seed, uint64_t stream, uint64_t index)
 {
-    return block_at(seed, stream, index / 4).x[index % 4];
+    return dar_philox_at(seed, stream, index / 4).x[index % 4];
 }
 
 uint64_t dar_rng_u64(uint64_t seed, uint64_t stream, uint64_t index)
 {
-    struct block b = block_at(seed, stream, index / 2);
+    dar_philox b = dar_philox_at(seed, stream, index / 2);
     return half(&b, index % 2);
 }
 
@@ -70,7 +51,7 @@ float dar_rng_f32(uint64_t seed, uint64_t stream, uint64_t index)
 
 double dar_rng_f64(uint64_t seed, uint64_t stream, uint64_t index)
 {
-    struct block b = block_at(seed, stream, index / 2);
+    dar_philox b = dar_philox_at(seed, stream, index / 2);
     return (double)half53(&b, index % 2) * 0x1p-53;
 }
 
@@ -130,13 +111,13 @@ static inline void turn(double v, double *cosine, double *sine)
     *sine = q & 2 ? -y : y;
 }
 
-static inline void uniform_pair(const struct block *b, double y[2])
+static inline void uniform_pair(const dar_philox *b, double y[2])
 {
     y[0] = (double)half53(b, 0) * 0x1p-53;
     y[1] = (double)half53(b, 1) * 0x1p-53;
 }
 
-static inline void normal_pair(const struct block *b, double y[2])
+static inline void normal_pair(const dar_philox *b, double y[2])
 {
     double u = (double)(half53(b, 0) + 1) * 0x1p-53, v = (double)half53(b, 1) * 0x1p-53;
     double r = sqrt(-2 * natural_log(u)), c, s;
@@ -147,7 +128,7 @@ static inline void normal_pair(const struct block *b, double y[2])
 
 double dar_rng_normal(uint64_t seed, uint64_t stream, uint64_t index)
 {
-    struct block b = block_at(seed, stream, index / 2);
+    dar_philox b = dar_philox_at(seed, stream, index / 2);
     double y[2];
     normal_pair(&b, y);
     return y[index % 2];
@@ -171,7 +152,7 @@ static void fill_range(void *ctx, size_t begin, size_t end, int thread)
     for (size_t at = begin; at < end; at += DAR_PIECE) {
         size_t n = end - at < DAR_PIECE ? end - at : DAR_PIECE;
         for (size_t i = 0; i < n; i += 2) {
-            struct block b = block_at(f->seed, f->stream, (at + i) / 2);
+            dar_philox b = dar_philox_at(f->seed, f->stream, (at + i) / 2);
             if (f->normal) normal_pair(&b, y + i);
             else uniform_pair(&b, y + i);
             y[i] = f->shift + f->scale * y[i];

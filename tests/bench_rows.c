@@ -75,28 +75,22 @@ static const bench_kind quantise = { .part = { "quantise" }, .setup = setup_quan
 
 /* ---------------------------------------------------------------- optimiser */
 
+/* The row's type is that of the moments. */
 static void setup_adamw(bench *b)
 {
-    for (int i = 0; i < 4; i++) b->x[i] = bench_tensor(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[1])); /* w, m, v, g */
-    float *v = b->x[2].data;
-    for (size_t i = 0; i < dar_tensor_count(&b->x[2]); i++) v[i] *= v[i];
-    b->bytes[0] = 7.0 * (double)dar_tensor_bytes(&b->x[0]); /* g is only read */
-}
-
-static void adamw_piece(void *ctx, size_t begin, size_t end, int thread)
-{
-    bench *b = ctx;
-    float *w = b->x[0].data, *m = b->x[1].data, *v = b->x[2].data, *g = b->x[3].data;
-    dar_adamw a = {
-        .rate = 1e-4, .beta1 = 0.9, .beta2 = 0.999, .eps = 1e-8, .decay = 0.01, .fix1 = 1.5, .fix2 = 20, .scale = 1
-    };
-    (void)thread;
-    dar_kern_for(DAR_F32)->adamw(end - begin, &a, w + begin, m + begin, v + begin, g + begin);
+    for (int i = 0; i < 4; i++) /* w, m, v, g */
+        b->x[i] = bench_tensor(b, i == 1 || i == 2 ? b->row->type : DAR_F32, DAR_SHAPE(b->s[0], b->s[1]));
+    dar_tensor_fill(&b->x[2], 0.1);
+    for (int i = 0; i < 4; i++) b->bytes[0] += 2.0 * (double)dar_tensor_bytes(&b->x[i]);
 }
 
 static void run_adamw(bench *b)
 {
-    dar_parallel_range(dar_tensor_count(&b->x[0]), 16384, adamw_piece, b);
+    dar_adamw a = {
+        .rate = 1e-4, .beta1 = 0.9, .beta2 = 0.999, .eps = 1e-8, .decay = 0.01, .fix1 = 1.5, .fix2 = 20, .scale = 1
+    };
+    dar_row_adamw(&a, DAR_F32, b->row->type, dar_tensor_count(&b->x[0]), b->x[0].data, b->x[1].data, b->x[2].data,
+                  b->x[3].data);
 }
 
 static const bench_kind adamw = { .part = { "adamw" }, .setup = setup_adamw, .run = { run_adamw } };
@@ -114,5 +108,6 @@ const bench_row bench_row_rows[] = {
     ROW(to_f32, DAR_F16, BENCH_COPY, 0),     ROW(quantise, DAR_F32, BENCH_COPY, 0),
     ROW(quantise, DAR_BF16, BENCH_COPY, 0),  ROW(nonfinite, DAR_F32, BENCH_READ, 0),
     ROW(nonfinite, DAR_BF16, BENCH_READ, 0), ROW(adamw, DAR_F32, BENCH_COPY, 0.8),
+    ROW(adamw, DAR_BF16, BENCH_COPY, 0),
 };
 const size_t bench_n_row_rows = DAR_COUNT(bench_row_rows);

@@ -1,4 +1,4 @@
-/* test_optim.c: AdamW against torch's, steps that are not finite, threads. */
+/* test_optim.c: AdamW against torch's, steps that are not finite, moments in bf16, threads. */
 #include "tests/test.h"
 
 #include "lib/json.h"
@@ -141,9 +141,104 @@ static void too_many(void **state)
     net_free(&n);
 }
 
+/* ---------------------------------------------------------------- moments in bf16 */
+
+#define N 50000
+
+typedef struct large {
+    dar_arena arena;
+    dar_params p;
+    dar_param *w;
+    dar_optim o;
+} large;
+
+static void large_init(large *l, bool bf16_moments)
+{
+    dar_optim_config c = dar_optim_default();
+    c.max_norm = 0;
+    c.warmup = 0;
+    c.decay = 0;
+    c.bf16_moments = bf16_moments;
+    c.seed = 5;
+    assert_int_equal(dar_arena_init(&l->arena, "test", 8 << 20, NULL), DAR_OK);
+    dar_params_init(&l->p, &l->arena, DAR_F32);
+    l->w = dar_params_add(&l->p, (dar_param_info){ DAR_PARAM_LORA, false, DAR_FRESH_VALUE, 0 }, DAR_SHAPE(N), "w");
+    dar_params_train(&l->p, DAR_PARAM_LORA);
+    dar_params_fresh(&l->p, DAR_PARAM_ALL, 1);
+    dar_params_gradients(&l->p);
+    dar_optim_init(&l->o, &c, &l->p, &l->arena);
+}
+
+static void large_free(large *l)
+{
+    dar_params_free(&l->p);
+    dar_arena_free(&l->arena);
+}
+
+static void large_steps(large *l, int from, int to)
+{
+    for (int k = from; k < to; k++) {
+        dar_tensor_fill(&l->w->g, 1 + 0.3 * sin(k));
+        assert_false(dar_optim_step(&l->o).skipped);
+    }
+}
+
+static double mean_of(const dar_tensor *x)
+{
+    double sum = 0;
+    for (size_t i = 0; i < N; i++) sum += dar_dtype_get(x->dtype, x->data, i);
+    return sum / N;
+}
+
+/* All elements have the same gradients, so the mean over them shows what rounding adds: a digit of bf16, 2^-8, at
+ * random at each step, of which v forgets a thousandth; over N elements, with five deviations, that is
+ * 5 * 2^-8 / 2 * sqrt(500 / N).  To the nearest, v stands still once a thousandth of it is less than half a digit. */
+static void unbiased(void **state)
+{
+    (void)state;
+    large wide, narrow;
+    large_init(&wide, false);
+    large_init(&narrow, true);
+    large_steps(&wide, 0, 400);
+    large_steps(&narrow, 0, 400);
+    double m = mean_of(&wide.o.m[0]), v = mean_of(&wide.o.v[0]), bound = 5 * 0x1p-9 * sqrt(500.0 / N);
+    CHECK_NEAR("m", mean_of(&narrow.o.m[0]) / m, 1, bound);
+    CHECK_NEAR("v", mean_of(&narrow.o.v[0]) / v, 1, bound);
+    CHECK_NEAR("w", mean_of(&narrow.w->x) / mean_of(&wide.w->x), 1, 2 * bound);
+    assert_int_equal(narrow.o.m[0].dtype, DAR_BF16);
+    large_free(&wide);
+    large_free(&narrow);
+}
+
+/* Whatever the threads and the processor can do, and from moments that were saved as they are. */
+static void same_bits(void **state)
+{
+    (void)state;
+    static const int threads[] = { 1, 2, 3, 7 };
+    unsigned level[5];
+    large first, other;
+    large_init(&first, true);
+    large_steps(&first, 0, 6);
+    int levels = test_levels(level), before = dar_threads();
+    for (int i = 0; i < 4 + levels; i++) {
+        large_init(&other, true);
+        if (i < 4) dar_threads_set(threads[i]);
+        else dar_cpu_init(level[i - 4]);
+        large_steps(&other, 0, 6);
+        assert_memory_equal(first.o.m[0].data, other.o.m[0].data, 2 * N);
+        assert_memory_equal(first.o.v[0].data, other.o.v[0].data, 2 * N);
+        assert_memory_equal(first.w->x.data, other.w->x.data, 4 * N);
+        large_free(&other);
+        dar_threads_set(before);
+    }
+    dar_cpu_init(DAR_CPU_ALL);
+    large_free(&first);
+}
+
 int main(void)
 {
     static const struct CMUnitTest tests[] = { cmocka_unit_test(against_torch), cmocka_unit_test(not_finite),
-                                               cmocka_unit_test(too_many) };
+                                               cmocka_unit_test(too_many), cmocka_unit_test(unbiased),
+                                               cmocka_unit_test(same_bits) };
     return cmocka_run_group_tests_name("optim", tests, NULL, NULL) != 0;
 }

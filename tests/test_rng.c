@@ -1,7 +1,8 @@
-/* test_rng.c: known answers, moments, threads, and PyTorch's stream. */
+/* test_rng.c: known answers, moments, threads, rounding at random, and PyTorch's stream. */
 #include "tests/test.h"
 
 #include "lib/json.h"
+#include "lib/kern.h"
 #include "lib/rng.h"
 #include "lib/rng_torch.h"
 
@@ -194,11 +195,78 @@ static void torch_stream(void **state)
     free(p);
 }
 
+/* Blocks in rows are the same blocks at every level of the processor, also where the index carries into its upper half,
+ * and none is written beyond the last. */
+static void rows_of_blocks(void **state)
+{
+    (void)state;
+    static const uint64_t at[] = { 0, 5, 0xfffffffd, 0xffffffffffffff00 };
+    unsigned level[5];
+    for (int l = 0; l < test_levels(level); l++) {
+        dar_cpu_init(level[l]);
+        for (size_t i = 0; i < DAR_COUNT(at); i++)
+            for (size_t n = 1; n <= 19; n++) {
+                uint32_t x[4 * 19 + 1], want[4];
+                x[4 * n] = 77;
+                dar_kern_for(DAR_F32)->philox(n, 0x123456789abcdef, 0xfedcba9876543210, at[i], x);
+                for (size_t k = 0; k < n; k++) {
+                    uint64_t index = at[i] + k;
+                    dar_rng_philox((uint32_t[]){ (uint32_t)index, (uint32_t)(index >> 32), 0x76543210, 0xfedcba98 },
+                                   (uint32_t[]){ 0x89abcdef, 0x1234567 }, want);
+                    assert_memory_equal(x + 4 * k, want, sizeof want);
+                }
+                assert_int_equal(x[4 * n], 77);
+            }
+    }
+    dar_cpu_init(DAR_CPU_ALL);
+}
+
+/* Of the 2^16 random halves exactly as many carry as there are units cut off: the mean is x, whatever x is. */
+static void dithered(void **state)
+{
+    (void)state;
+    static const float xs[] = { 0, 1, -1, 1.00390625f, 1.001f, -1.001f, 3.1e-38f, 1e-40f, -1e-45f, 3e38f, 0x1.8p-20f };
+    static uint32_t random[65536 + 7];
+    static float x[65536 + 7];
+    static uint16_t y[65536 + 7];
+    unsigned level[5];
+    for (int l = 0; l < test_levels(level); l++) {
+        dar_cpu_init(level[l]);
+        for (size_t i = 0; i < DAR_COUNT(random); i++) random[i] = (uint32_t)i * 40503 % 65536 | (uint32_t)i << 16;
+        for (size_t k = 0; k < DAR_COUNT(xs); k++)
+            for (int half = 0; half < 2; half++) {
+                uint32_t bits, ups = 0;
+                memcpy(&bits, &xs[k], sizeof bits);
+                for (size_t i = 0; i < DAR_COUNT(x); i++) x[i] = xs[k];
+                dar_kern_for(DAR_F32)->dither(65536, random, half, x, y);
+                for (size_t i = 0; i < 65536; i++) ups += y[i] != bits >> 16;
+                assert_int_equal(ups, bits & 0xffff);
+                for (size_t i = 0; i < 65536; i++) assert_in_range(y[i], bits >> 16, (bits >> 16) + 1);
+            }
+        /* Among others, at every place of a vector. */
+        for (size_t i = 0; i < DAR_COUNT(x); i++) x[i] = 1;
+        for (size_t i = 0; i < 64; i++) {
+            x[17 * i + 3] = i % 3 == 0 ? NAN : i % 3 == 1 ? INFINITY : -INFINITY;
+            random[17 * i + 3] = UINT32_MAX;
+        }
+        y[17 * 64] = 9;
+        dar_kern_for(DAR_F32)->dither(17 * 64, random, 1, x, y);
+        for (size_t i = 0; i < 17 * 64; i++) {
+            float z = dar_bf16_to_f32(y[i]);
+            CHECK(z == x[i] || (isnan(z) && isnan(x[i])), "level %d, %zu: found %g, expected %g", l, i, (double)z,
+                  (double)x[i]);
+        }
+        assert_int_equal(y[17 * 64], 9);
+    }
+    dar_cpu_init(DAR_CPU_ALL);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(known_answers), cmocka_unit_test(ranges), cmocka_unit_test(normal_formula),
-        cmocka_unit_test(moments),       cmocka_unit_test(fills),  cmocka_unit_test(torch_stream),
+        cmocka_unit_test(known_answers),  cmocka_unit_test(ranges),   cmocka_unit_test(normal_formula),
+        cmocka_unit_test(moments),        cmocka_unit_test(fills),    cmocka_unit_test(torch_stream),
+        cmocka_unit_test(rows_of_blocks), cmocka_unit_test(dithered),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }

@@ -69,7 +69,6 @@ static void update(struct trainer *r, dar_param *q)
     a.fix1 = 1 / (1 - pow(a.beta1, r->t));
     a.fix2 = 1 / (1 - pow(a.beta2, r->t));
     dar_row_adamw(&a, q->g.dtype, q->g.dtype, count, q->x.data, m, v, q->g.data);
-    dar_tensor_fill(&q->g, 0);
 }
 
 static double train(struct trainer *r)

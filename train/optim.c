@@ -4,9 +4,11 @@
 #include <math.h>
 
 #include "lib/kern.h"
+#include "lib/rng.h"
 #include "lib/thread.h"
 
 #define CHUNK     ((size_t)64 * 1024) /* elements of a partial sum */
+#define PLACES    40                  /* bits of an index that say which element of a tensor, the rest which step */
 #define CLIP_TINY 1e-6                /* keeps the scale finite, as in torch */
 
 dar_optim_config dar_optim_default(void)
@@ -79,14 +81,17 @@ dar_optim_report dar_optim_step(dar_optim *o)
     dar_adamw a = { .rate = r.rate, .beta1 = c->beta1, .beta2 = c->beta2, .eps = c->eps, .decay = c->decay };
     a.fix1 = 1 / (1 - pow(c->beta1, t));
     a.fix2 = 1 / (1 - pow(c->beta2, t));
+    a.seed = c->seed;
+    a.index = (uint64_t)o->steps << PLACES;
     a.scale = c->max_norm > 0 ? fmin(1, c->max_norm / (r.norm + CLIP_TINY)) : 1;
     for (size_t i = 0; i < p->count; i++) {
         dar_param *q = p->at[i];
         if (!q->trainable) continue;
-        if (!r.skipped)
+        a.stream = dar_rng_stream(q->name) ^ dar_rng_stream("moments"); /* not that of fresh values */
+        if (r.skipped) dar_tensor_fill(&q->g, 0);
+        else
             dar_row_adamw(&a, p->main, o->m[i].dtype, dar_tensor_count(&q->x), q->x.data, o->m[i].data, o->v[i].data,
                           q->g.data);
-        dar_tensor_fill(&q->g, 0);
     }
     o->in_a_row = r.skipped ? o->in_a_row + 1 : 0;
     if (r.skipped) o->skipped++;
