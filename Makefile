@@ -161,9 +161,10 @@ lint: ## the quick half of check: layers, style, format, headers alone
 check: ## lint, then gcc, clang, debug and sanitizer builds, tests in release and under sanitizers
 	@scripts/check.sh
 
-stress: deps ## where numbers break: tests/test_stress.c, with the tests that take gigabytes of memory
-	@$(MAKE) --no-print-directory $B/test_stress
+stress: deps ## where numbers break, with tests that take gigabytes of memory; training killed 200 times
+	@$(MAKE) --no-print-directory all $B/test_stress $B/test_kill
 	@$B/test_stress full
+	@$B/test_kill full
 
 ulp: ## exp, tanh, rsqrt, silu at all 2^32 arguments against f64, at every CPU level; a few minutes
 	@$(MAKE) --no-print-directory $B/ulp
