@@ -42,8 +42,9 @@ static void steps(dar_journal *j, int64_t from, int64_t to)
     for (int64_t k = from; k <= to; k++) {
         ok(step(j, k, &e), &e);
         if (k % 20) continue;
-        dar_json_writer *w = dar_journal_line(j, "validate", k);
+        dar_json_writer *w = dar_journal_line(j, "sensitivity", k);
         dar_json_write_number(w, "loss", 0.5 / (double)k);
+        dar_json_write_number(w, "shuffled", 0.75 / (double)k);
         ok(dar_journal_end(j, &e), &e);
     }
 }
@@ -146,7 +147,10 @@ static void lines(void **state)
         else CHECK_NEAR("bucket", bucket, loss_at(k), 0);
     }
     assert_int_equal(*at, 0);
-    assert_true(run_is_there(in_dir("lines/loss.svg")) && run_is_there(in_dir("lines/loss_sigma.svg")));
+    assert_true(run_is_there(in_dir("lines/loss_sigma.svg")) && !run_is_there(in_dir("lines/psnr.svg")));
+    run_read(in_dir("lines/loss.svg"), text, sizeof text);
+    assert_non_null(strstr(text, ">40, 0.0125</title>"));
+    assert_non_null(strstr(text, ">40, 0.01875</title>"));
 }
 
 /* However a line ends early, what is before it stays; what is after the checkpoint goes. */

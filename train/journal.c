@@ -53,6 +53,8 @@ static bool read_line(const char *text, size_t size, dar_json_doc **doc, dar_jou
     x->norm = number_of(j, "norm");
     x->rate = number_of(j, "rate");
     x->seconds = number_of(j, "seconds");
+    x->shuffled = number_of(j, "shuffled");
+    x->psnr = number_of(j, "psnr");
     dar_json_accept(j);
     x->skipped = isnan(x->norm); /* "skipped" may be null */
     return dar_json_finish(*doc, NULL) == DAR_OK;

@@ -14,14 +14,15 @@
  *   {"kind": "start", "step": 0, "time": "2030-01-31T23:59:59Z", "threads": 2}       whenever the program starts
  *   {"kind": "step", "step": 1, "loss": .., "smoothed": .., "sigma": .., "norm": .., "rate": .., "seconds": ..,
  *    "tokens_per_second": .., "fraction_of_peak": .., "peak_bytes": .., "skipped": NAME}
- *   {"kind": "validate", "step": 1, ...}                                             or any other: dar_journal_line
+ *   {"kind": "validate", "step": 1, "psnr": .., ...}                                 train/validate.h
+ *   {"kind": "sensitivity", "step": 1, "loss": .., "shuffled": .., ...}
  *
  * "smoothed" is the mean of the finite losses so far, each weighing 0.99 of the next; "skipped" is there if the step
  * was, with the parameter whose gradient is not finite, or null.
  *
  * The rest is made of that file anew: loss.csv, a row per some steps (at most 500 rows) with the mean loss, also by
- * sigma in tenths; loss.svg, the loss over steps, with that of other lines that have one; loss_sigma.svg, the loss by
- * sigma in the quarters of the run. */
+ * sigma in tenths; loss.svg, the loss over steps, in training and on clips of validation, with their own condition and
+ * with another's; loss_sigma.svg, the loss by sigma in the quarters of the run; psnr.svg, of samples, if there are. */
 #ifndef DAR_TRAIN_JOURNAL_H
 #define DAR_TRAIN_JOURNAL_H
 

@@ -14,7 +14,7 @@
 #define ROWS     500 /* at most */
 #define BUCKETS  10  /* of sigma, from 0 to 1 */
 #define QUARTERS 4
-#define POINTS   500 /* of lines that are no steps */
+#define POINTS   500 /* of validation */
 
 typedef struct mean {
     double n, sum, square;
@@ -31,8 +31,9 @@ typedef struct table {
     int64_t steps, every; /* steps in all; in a row */
     row row[ROWS];
     mean quarter[QUARTERS][BUCKETS];
-    double other[2][POINTS]; /* step, loss */
-    size_t others;
+    double look[3][POINTS];   /* step, loss with the clip's own condition, with another's */
+    double sample[2][POINTS]; /* step, PSNR [dB] */
+    size_t looks, samples;
 } table;
 
 static void add(mean *m, double x)
@@ -65,13 +66,16 @@ static bool count(void *ctx, const dar_journal_past *x)
 static bool collect(void *ctx, const dar_journal_past *x)
 {
     table *t = ctx;
-    if (strcmp(x->kind, "step") != 0) {
-        if (isfinite(x->loss) && t->others < POINTS) {
-            t->other[0][t->others] = (double)x->step;
-            t->other[1][t->others++] = x->loss;
-        }
-        return true;
+    if (isfinite(x->shuffled) && t->looks < POINTS) {
+        t->look[0][t->looks] = (double)x->step;
+        t->look[1][t->looks] = x->loss;
+        t->look[2][t->looks++] = x->shuffled;
     }
+    if (isfinite(x->psnr) && t->samples < POINTS) {
+        t->sample[0][t->samples] = (double)x->step;
+        t->sample[1][t->samples++] = x->psnr;
+    }
+    if (strcmp(x->kind, "step") != 0) return true;
     if (x->step < 1 || x->step > t->steps) return true;
     row *r = &t->row[(x->step - 1) / t->every];
     r->step = x->step;
@@ -155,17 +159,24 @@ static dar_status draw_loss(const table *t, const char *path, dar_err *e)
     const dar_plot_series series[] = {
         { .label = faint, .faint = true, .n = n, .x = x, .y = mean_of },
         { .label = "smoothed", .n = n, .x = x, .y = smoothed },
-        { .label = "validation",
+        { .label = "validation", .mark = DAR_PLOT_BOTH, .colour = 1, .n = t->looks, .x = t->look[0], .y = t->look[1] },
+        { .label = "with another clip's condition",
           .mark = DAR_PLOT_BOTH,
-          .colour = 1,
-          .n = t->others,
-          .x = t->other[0],
-          .y = t->other[1] },
+          .colour = 4,
+          .n = t->looks,
+          .x = t->look[0],
+          .y = t->look[2] },
     };
-    dar_plot p = { .title = "Loss", .x.label = "step", .y.label = "loss", .series = series };
+    dar_plot p = { .title = "Loss", .x.label = "step", .y.label = "loss", .series = series, .n = t->looks ? 4 : 2 };
     p.y.log = true;
-    p.n = t->others ? 3 : 2;
     return dar_plot_write(&p, path, e);
+}
+
+static dar_status draw_psnr(const table *t, const char *path, dar_err *e)
+{
+    const dar_plot_series series = { .mark = DAR_PLOT_BOTH, .n = t->samples, .x = t->sample[0], .y = t->sample[1] };
+    dar_plot p = { .title = "Samples", .x.label = "step", .y.label = "PSNR [dB]", .series = &series, .n = 1 };
+    return t->samples ? dar_plot_write(&p, path, e) : DAR_OK;
 }
 
 static dar_status draw_sigma(const table *t, const char *path, dar_err *e)
@@ -198,7 +209,10 @@ static dar_status draw_all(const char *run, table *t, dar_err *e)
     static const struct {
         const char *name;
         dar_status (*make)(const table *t, const char *path, dar_err *e);
-    } files[] = { { "loss.csv", write_csv }, { "loss.svg", draw_loss }, { "loss_sigma.svg", draw_sigma } };
+    } files[] = { { "loss.csv", write_csv },
+                  { "loss.svg", draw_loss },
+                  { "loss_sigma.svg", draw_sigma },
+                  { "psnr.svg", draw_psnr } };
     char path[PATH_MAX];
     size_t size;
     snprintf(path, sizeof path, "%.4000s/%s", run, DAR_JOURNAL_LOG);
