@@ -292,6 +292,31 @@ static void another_run(void **state)
     assert_int_equal(run_remove("one"), 0);
 }
 
+/* What was said on standard error while a run is resumed with another configuration. */
+static void another_configuration(void **state)
+{
+    (void)state;
+    run r;
+    dar_err e;
+    char text[4096];
+    run_init(&r, "changed", DAR_PARAM_LORA, DAR_F32, false, 1);
+    open_run(&r);
+    r.c.config = "{\"rate\": 0.1, \"list\": [1, 2], \"in\": {\"side\": true, \"same\": \"x\"}, \"gone\": 1}";
+    save(&r, 1);
+    r.c.config = "{\"rate\": 0.2, \"list\": [1, 2], \"in\": {\"side\": \"no\", \"same\": \"x\"}, \"new\": null}";
+    int saved = dup(STDERR_FILENO), file = open("told", O_RDWR | O_CREAT | O_TRUNC, 0666);
+    assert_true(saved >= 0 && file >= 0 && dup2(file, STDERR_FILENO) >= 0);
+    dar_status s = dar_checkpoint_resume(&r.c, "auto", &e);
+    assert_true(dup2(saved, STDERR_FILENO) >= 0);
+    close(saved);
+    close(file);
+    ok(s, &e);
+    run_read("told", text, sizeof text);
+    assert_string_equal(text, "rate: 0.1 before, 0.2 now\nin.side: true before, \"no\" now\n");
+    run_free(&r);
+    assert_int_equal(run_remove("changed"), 0);
+}
+
 /* ---------------------------------------------------------------- damage */
 
 /* A file of a checkpoint, and what it was before. */
@@ -454,8 +479,8 @@ int main(void)
 {
     static const struct CMUnitTest tests[] = {
         cmocka_unit_test(there_and_back),   cmocka_unit_test(autoencoder), cmocka_unit_test(others_read_it),
-        cmocka_unit_test(newest_ones_stay), cmocka_unit_test(another_run), cmocka_unit_test(damaged),
-        cmocka_unit_test(disk_full),        cmocka_unit_test(left_overs),
+        cmocka_unit_test(newest_ones_stay), cmocka_unit_test(another_run), cmocka_unit_test(another_configuration),
+        cmocka_unit_test(damaged),          cmocka_unit_test(disk_full),   cmocka_unit_test(left_overs),
     };
     return cmocka_run_group_tests_name("checkpoint", tests, in_directory, scratch_remove) != 0;
 }

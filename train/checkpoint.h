@@ -54,8 +54,8 @@ void dar_checkpoint_close(dar_checkpoint *c); /* accepts one that was not opened
  *            the run has none; if it has, and all are damaged, that is a failure
  *   DIR      that one, of this or of another run.  Refused if this run has a newer one that is whole
  *
- * Fails if seed, names, shapes or types are not those of the run.  After a failure parameters and moments are
- * undefined. */
+ * Keys of the configuration that are others than they were are named in a line each.  Fails if seed, names, shapes or
+ * types are not those of the run.  After a failure parameters and moments are undefined. */
 dar_status dar_checkpoint_resume(dar_checkpoint *c, const char *from, dar_err *e);
 
 /* Write checkpoint-STEP.  Then only the newest `keep` stay; newer ones than this are damaged (see resume) and go.

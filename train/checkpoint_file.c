@@ -9,16 +9,18 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "lib/file.h"
 #include "lib/json.h"
+#include "lib/log.h"
 #include "lib/safetensors_write.h"
 #include "lib/sha256.h"
 #include "lib/weights.h"
 #include "models/lora.h"
 #include "train/checkpoint_inside.h"
 
-static const char summary[] = "checkpoint.json";
+static const char summary[] = "checkpoint.json", config_name[] = "config.json";
 
 static dar_status join(char path[PATH_MAX], const char *directory, const char *name, dar_err *e)
 {
@@ -151,7 +153,7 @@ static dar_status write_files(const dar_checkpoint *c, const char *directory, da
 {
     const struct {
         const char *name, *text;
-    } texts[] = { { "config.json", c->config }, { "model.json", c->model } };
+    } texts[] = { { config_name, c->config }, { "model.json", c->model } };
     char path[PATH_MAX];
     for (int i = 0; i < PARTS; i++) {
         if (!has(c, (part)i)) continue;
@@ -364,9 +366,49 @@ static dar_status read_part(const dar_checkpoint *c, part which, const char *dir
     return s;
 }
 
+/* Name the keys whose values are others than they were.  `path` is that of the two objects. */
+static void tell_changes(dar_json was, dar_json is, const char *path)
+{
+    dar_json_writer w[2] = { { .pretty = false }, { .pretty = false } };
+    for (dar_json x = dar_json_first(is); x.item; x = dar_json_next(x)) {
+        char at[256];
+        dar_json old = dar_json_get(was, dar_json_key(x));
+        snprintf(at, sizeof at, "%s%s%s", path, *path ? "." : "", dar_json_key(x));
+        if (dar_json_kind_of(x) == DAR_JSON_OBJECT && dar_json_kind_of(old) == DAR_JSON_OBJECT) {
+            tell_changes(old, x, at);
+            continue;
+        }
+        for (int i = 0; i < 2; i++) {
+            dar_json_writer_reset(&w[i]);
+            if (i || old.item) dar_json_write_value(&w[i], NULL, i ? x : old);
+            else dar_json_write_null(&w[i], NULL);
+        }
+        if (w[0].failed || w[1].failed || strcmp(w[0].text, w[1].text) == 0) continue;
+        dar_log(DAR_LOG_INFO, "%s: %s before, %s now", at, w[0].text, w[1].text);
+    }
+    for (int i = 0; i < 2; i++) dar_json_writer_free(&w[i]);
+}
+
+/* A run may go on with another configuration, but not unawares. */
+static dar_status compare_configs(const dar_checkpoint *c, const char *directory, dar_err *e)
+{
+    char path[PATH_MAX];
+    dar_json_doc *was, *is;
+    if (!c->config) return DAR_OK;
+    DAR_TRY(join(path, directory, config_name, e));
+    if (access(path, F_OK) != 0) return DAR_OK;
+    DAR_TRY(dar_json_open(&was, path, e));
+    dar_status s = dar_json_parse(&is, config_name, c->config, strlen(c->config), e);
+    if (s == DAR_OK) tell_changes(dar_json_root(was), dar_json_root(is), "");
+    dar_json_close(was);
+    dar_json_close(is);
+    return s;
+}
+
 dar_status dar_checkpoint_read(dar_checkpoint *c, const char *directory, dar_err *e)
 {
     for (int i = 0; i < PARTS; i++)
         if (has(c, (part)i)) DAR_TRY(read_part(c, (part)i, directory, e));
-    return read_state(c, directory, e);
+    DAR_TRY(read_state(c, directory, e));
+    return compare_configs(c, directory, e);
 }
