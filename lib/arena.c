@@ -7,7 +7,7 @@
 #include <sys/mman.h>
 
 #define HUGE_PAGE ((size_t)2 << 20)
-#define PLAN_SIZE ((size_t)1 << 44) /* address space, not memory */
+#define PLAN_SIZE ((size_t)1 << 42) /* address space, not memory: there is room for some thirty of them */
 
 static dar_status map(dar_arena *a, const char *name, size_t bytes, int prot, dar_err *e)
 {
