@@ -10,8 +10,8 @@
 #include "lib/program.h"
 
 static struct {
-    const char *out, *base;
-    dar_arg_list against, lpips;
+    const char *out, *base, *key;
+    dar_arg_list against, lpips, study, answers;
     int align;
     bool masked, no_reference, no_report, overwrite;
     int64_t tile;
@@ -46,6 +46,15 @@ static const dar_option options[] = {
     { .name = "no-report", .type = DAR_ARG_FLAG, .target = &o.no_report, .help = "numbers only: no report.html" },
     { .name = "tile", .placeholder = "PX", .type = DAR_ARG_INT, .target = &o.tile, .lo = 16, .hi = 4096,
       .help = "width of a picture in it (default: as large as keeps the report below 60 MB, at most 320)" },
+
+    { .help = "People" },
+    { .name = "study", .placeholder = "A:B...", .type = DAR_ARG_WORDS, .target = &o.study,
+      .help = "measure nothing: make study.html, which shows pairs of videos of A and B without their names and asks "
+      "three questions, in an order drawn from --seed, and study-key.json, which it is read with" },
+    { .name = "answers", .placeholder = "FILE...", .type = DAR_ARG_WORDS, .target = &o.answers,
+      .help = "what people saved from study.html: preferences with intervals and tests, answers.md and .json" },
+    { .name = "key", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.key,
+      .help = "study-key.json of their study" },
 };
 /* clang-format on */
 
@@ -54,7 +63,11 @@ static const dar_option options[] = {
 static dar_status check_options(const dar_run *r, dar_err *e)
 {
     struct stat st;
-    if (!o.against.n) return dar_fail(e, DAR_ERR_USAGE, "%s: expected --against BUNDLES", r->program->name);
+    if (o.answers.n && !o.key) return dar_fail(e, DAR_ERR_USAGE, "--answers: expected --key study-key.json with it");
+    if (!o.answers.n && !r->program->rests)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: expected a method's directory", r->program->name);
+    if (!o.answers.n && !o.against.n)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: expected --against BUNDLES", r->program->name);
     if (!o.out) return dar_fail(e, DAR_ERR_USAGE, "%s: expected -o DIR", r->program->name);
     if (!o.overwrite && lstat(o.out, &st) == 0)
         return dar_fail(e, DAR_ERR_USAGE, "%s: is there already; it is not overwritten unasked", o.out);
@@ -97,6 +110,7 @@ static size_t tile_width(const dar_eval *v)
 
 static dar_status find_all(dar_eval *v, const dar_run *r, dar_err *e)
 {
+    if (o.answers.n) return DAR_OK;
     DAR_TRY(dar_eval_find_clips(v, o.against.at, o.against.n, e));
     DAR_TRY(dar_eval_find_methods(v, r->program->rest, (size_t)r->program->rests, !o.no_reference, e));
     DAR_TRY(find_base(v, e));
@@ -174,6 +188,21 @@ static dar_status work(dar_eval *v, dar_err *e)
     return s;
 }
 
+/* Into v->out; *n: trials or answers. */
+static dar_status ask(dar_eval *v, size_t *n, dar_err *e)
+{
+    return o.answers.n ? dar_eval_answers(v, o.key, o.answers.at, o.answers.n, n, e)
+                       : dar_eval_study(v, o.study.at, o.study.n, n, e);
+}
+
+static void tell_people(dar_run *r, size_t n)
+{
+    const char *what = o.answers.n ? "answers" : "trials";
+    dar_run_say(r, "%s: %zu %s", o.out, n, what);
+    dar_json_write_int(&r->json, what, (int64_t)n);
+    dar_json_write_text(&r->json, "out", o.out);
+}
+
 static void free_all(dar_eval *v)
 {
     for (size_t i = 0; v->cell && i < v->methods * v->clips; i++) free(v->cell[i].frame);
@@ -193,15 +222,18 @@ static dar_status evaluate(dar_run *r, dar_err *e)
     DAR_TRY(check_options(r, e));
     v.work = malloc(DAR_BOOTSTRAP * sizeof *v.work);
     dar_status s = v.work ? find_all(&v, r, e) : dar_fail(e, DAR_ERR_NOMEM, "dar-eval: out of memory");
+    bool people = o.answers.n || o.study.n;
+    size_t n = 0;
     if (s == DAR_OK && o.common.dry_run) {
-        plan(&v, r);
+        if (!o.answers.n) plan(&v, r);
     } else if (s == DAR_OK) {
         s = dar_dir_create(&dir, o.out, e);
         v.out = dir.temp;
-        if (s == DAR_OK) s = work(&v, e);
+        if (s == DAR_OK) s = people ? ask(&v, &n, e) : work(&v, e);
         if (s == DAR_OK) s = dar_dir_commit(&dir, o.overwrite, e);
         dar_dir_discard(&dir);
-        if (s == DAR_OK) tell(&v, r);
+        if (s == DAR_OK && people) tell_people(r, n);
+        else if (s == DAR_OK) tell(&v, r);
     }
     free_all(&v);
     return s;
@@ -221,7 +253,7 @@ int main(int argc, char **argv)
         .rest_help = "methods: a directory with pictures or a video for each bundle, by the bundle's name, such as "
                      "dar-sample leaves; NAME may be a channel set, with @STEP after it; method.json in the directory "
                      "may say name, set, mode, step, seed, external",
-        .rest_least = 1,
+        .rest_least = 0,
         .rest_most = 1000,
     };
     return dar_program_main(&program, argc, argv);

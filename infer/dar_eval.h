@@ -8,7 +8,8 @@
  *   dar_eval_paper.c     which tables there are
  *   dar_eval_file.c      JSON and CSV
  *   dar_eval_page.c      the report in HTML
- *   dar_eval_study.c     pages that ask people, and what they answered */
+ *   dar_eval_study.c     a page that asks people
+ *   dar_eval_answers.c   what they answered */
 #ifndef DAR_INFER_DAR_EVAL_H
 #define DAR_INFER_DAR_EVAL_H
 
@@ -124,6 +125,9 @@ bool dar_eval_find(const dar_eval *v, size_t m, size_t c, char path[PATH_MAX]);
 /* Measure all methods on clip c; pictures for the report go to v->out. */
 dar_status dar_eval_clip_run(dar_eval *v, size_t c, dar_err *e);
 
+/* Frame of a clip of `from` frames at the time of frame t of `to`: round(t / (to - 1) (from - 1)). */
+size_t dar_eval_same_time(size_t t, size_t to, size_t from);
+
 /* Frame 0 carried along: every covered pixel of a frame takes the colour of the element of frame 0 with its identity.
  */
 typedef struct dar_eval_warp dar_eval_warp;
@@ -190,6 +194,19 @@ dar_interval dar_eval_interval(dar_eval *v, size_t m, size_t base, const dar_eva
 
 dar_status dar_eval_files(dar_eval *v, const dar_eval_sheets *s, dar_err *e);
 dar_status dar_eval_page(dar_eval *v, const dar_eval_sheets *s, dar_err *e);
+
+/* ---------------------------------------------------------------- people */
+
+#define DAR_EVAL_QUESTIONS 3
+
+extern const char *const dar_eval_question[DAR_EVAL_QUESTIONS][2]; /* name, words */
+
+/* study.html and study-key.json: pairs are NAME:NAME. */
+dar_status dar_eval_study(dar_eval *v, const char *const *pair, size_t n, size_t *trials, dar_err *e);
+
+/* What people answered: by pair and question, and by camera path and family; answers.md, answers.json in v->out. */
+dar_status dar_eval_answers(dar_eval *v, const char *key, const char *const *file, size_t n, size_t *answers,
+                            dar_err *e);
 
 /* A file of v->out, in one moment; text and size as open_memstream left them. */
 dar_status dar_eval_write(const dar_eval *v, const char *name, const char *text, size_t size, dar_err *e);

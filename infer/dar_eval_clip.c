@@ -76,8 +76,7 @@ static void measure(struct work *w, size_t m, size_t t)
     if (w->film) dar_eval_film_add(w->film, 1 + m, t, w->found, dar_metric_map(w->metric));
 }
 
-/* Frame of a clip of `from` frames at the time of frame t of `to`: round(t / (to - 1) (from - 1)). */
-static size_t same_time(size_t t, size_t to, size_t from)
+size_t dar_eval_same_time(size_t t, size_t to, size_t from)
 {
     return to > 1 ? (2 * t * (from - 1) + (to - 1)) / (2 * (to - 1)) : 0;
 }
@@ -101,7 +100,7 @@ static dar_status run_pictures(struct work *w, size_t m, const char *path, dar_e
     DAR_TRY(dar_pictures_open_any(&p, path, w->clip->width, w->clip->height, &frames, e));
     dar_status s = check_length(w, path, frames, dar_pictures_resized(p), e);
     for (size_t t = 0; t < w->frames && s == DAR_OK; t++) {
-        for (size_t last = same_time(t, w->frames, frames); read <= last && s == DAR_OK; read++)
+        for (size_t last = dar_eval_same_time(t, w->frames, frames); read <= last && s == DAR_OK; read++)
             s = dar_pictures_read(p, w->found, e);
         if (s == DAR_OK) s = check_length(w, path, frames, dar_pictures_resized(p), e);
         if (s == DAR_OK) measure(w, m, t);

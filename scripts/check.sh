@@ -50,6 +50,10 @@ shell_syntax() {
     for f in scripts/*.sh .ci/run; do sh -n "$f" || return 1; done
 }
 
+pages() {
+    scripts/install-deps.sh pages && scripts/check-pages.sh build/check/gcc-release
+}
+
 # Every global name of the library starts with dar_.
 names() {
     nm -g --defined-only "$1" | awk 'NF == 3 && $3 !~ /^dar_/ { print "exported: " $3; bad = 1 } END { exit bad }'
@@ -68,6 +72,7 @@ rule "headers alone" build gcc debug headers
 [ "$1" = static ] || [ -n "$failed" ] && finish
 
 rule "gcc release: build and tests" build gcc release test-built
+rule "pages in a browser" pages
 rule "exported names" names build/check/gcc-release/libdar.a
 rule "clang release: build and tests" build clang release test-built
 rule "gcc debug: build" build gcc debug

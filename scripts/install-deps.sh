@@ -4,6 +4,8 @@ need="gcc make libc6-dev libopenblas-openmp-dev libcjson-dev libcmocka-dev
 libmeshoptimizer-dev libpng-dev libjpeg62-turbo-dev libhdf5-dev zlib1g-dev libopenexr-dev ffmpeg"
 # `make check` and `make fuzz` want clang too: scripts/install-deps.sh check
 [ "$1" = check ] && need="$need clang clang-format libomp-dev libclang-rt-14-dev"
+# the rule of `make check` that opens pages: scripts/install-deps.sh pages
+[ "$1" = pages ] && need="$need chromium"
 missing=
 for p in $need; do
     [ "$(dpkg-query -W -f='${db:Status-Status}' "$p" 2>/dev/null)" = installed ] || missing="$missing $p"

@@ -291,12 +291,84 @@ static void test_report(void **state)
     CHECK(links >= 6 && films == 4, "%zu links, %zu films", links, films);
 }
 
+/* ---------------------------------------------------------------- people */
+
+/* The page says no name and no clip, and is the same for one seed. */
+static void test_study(void **state)
+{
+    (void)state;
+    GOOD("zebra=same", "quagga=offset", "--against", "set", "--study", "zebra:quagga", "-o", "study", "--seed", "1");
+    GOOD("zebra=same", "quagga=offset", "--against", "set", "--study", "zebra:quagga", "-o", "again", "--seed", "1");
+    run_same_file("study/study.html", "again/study.html");
+    run_same_file("study/study-key.json", "again/study-key.json");
+    const char *page = text_of("study/study.html");
+    static const char *const secret[] = {
+        "zebra", "quagga", "000000", "000001", "4d_vis", "dar-eval-", "dolly", "orbit"
+    };
+    for (size_t i = 0; i < DAR_COUNT(secret); i++) CHECK(!strstr(page, secret[i]), "the page says %s", secret[i]);
+    size_t films = 0;
+    for (const char *p = page; (p = strstr(p, "data-film=\"")); films++) check_film(page, p += 11);
+    CHECK(films == 6, "%zu films", films);
+    assert_false(run_is_there("study/film.mp4"));
+    bool differs = false;
+    for (int seed = 2; seed < 10; seed++) {
+        char number[8], out[16], key[32];
+        snprintf(number, sizeof number, "%d", seed);
+        snprintf(out, sizeof out, "seed%d", seed);
+        snprintf(key, sizeof key, "%s/study-key.json", out);
+        GOOD("zebra=same", "quagga=offset", "--against", "set", "--study", "zebra:quagga", "-o", out, "--seed", number);
+        char *first = strdup(text_of(key));
+        differs |= strcmp(first, text_of("study/study-key.json")) != 0;
+        free(first);
+    }
+    CHECK(differs, "the seed changes nothing");
+    BAD(2, "expected two methods as NAME:NAME", "same", "--against", "set", "--study", "same:other", "-o", "wrong");
+}
+
+/* Somebody who prefers the first method in both trials, whose sides the key tells. */
+static void write_answers(const char *path, const char *participant, const char *study)
+{
+    FILE *f = fopen(path, "w");
+    assert_non_null(f);
+    fprintf(f, "{\"format\": \"dar-study-answers/1\", \"study\": \"%s\", \"participant\": \"%s\", \"answers\": [",
+            study, participant);
+    int i = 0;
+    for (dar_json j = dar_json_first(dar_json_get(dar_json_root(doc), "trials")); j.item; j = dar_json_next(j), i++)
+        fprintf(f, "%s{\"trial\": %d, \"question\": \"motion\", \"choice\": \"%s\", \"seconds\": 2}", i ? "," : "", i,
+                strcmp(dar_json_text(j, "left", ""), dar_json_text(j, "first", "")) == 0 ? "left" : "right");
+    fputs("]}", f);
+    assert_int_equal(fclose(f), 0);
+}
+
+static void test_answers(void **state)
+{
+    dar_err e;
+    (void)state;
+    GOOD("same", "offset", "--against", "set", "--study", "same:offset", "-o", "asked", "--seed", "5");
+    assert_int_equal(dar_json_open(&doc, "asked/study-key.json", &e), DAR_OK);
+    const char *study = dar_json_text(dar_json_root(doc), "study", "");
+    write_answers("a.json", "ada", study);
+    write_answers("b.json", "bob", study);
+    write_answers("c.json", "eve", "of something else");
+    GOOD("--answers", "a.json", "b.json", "--key", "asked/study-key.json", "-o", "told");
+    char *text = text_of("told/answers.md"); /* four of four: p = 2 / 2^4 */
+    CHECK(strstr(text, "| same | offset | motion | all | 4 | 100.0 % [100.0, 100.0] | 0.125 |"), "%s", text);
+    CHECK(strstr(text, "by camera path"), "%s", text);
+    BAD(2, "a second answer of ada", "--answers", "a.json", "a.json", "--key", "asked/study-key.json", "-o", "wrong");
+    BAD(2, "expected the study of the key", "--answers", "c.json", "--key", "asked/study-key.json", "-o", "wrong");
+    BAD(2, "expected --key", "--answers", "a.json", "-o", "wrong");
+    run_write("none.json", "{\"format\": \"dar-study-answers/1\"}", 34);
+    BAD(2, "none.json", "--answers", "none.json", "--key", "asked/study-key.json", "-o", "wrong");
+    dar_json_close(doc);
+}
+
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_known),         cmocka_unit_test(test_time),    cmocka_unit_test(test_size),
         cmocka_unit_test(test_missing_clips), cmocka_unit_test(test_refused), cmocka_unit_test(test_names),
-        cmocka_unit_test(test_threads),       cmocka_unit_test(test_report),
+        cmocka_unit_test(test_threads),       cmocka_unit_test(test_report),  cmocka_unit_test(test_study),
+        cmocka_unit_test(test_answers),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-eval") || !run_find(bundler, argv[0], "dar-bundle")) return 1;
