@@ -92,7 +92,7 @@ static dar_status find_base(dar_eval *v, dar_err *e)
                     v->method[0].name);
 }
 
-/* Pixels that a report of 60 MB has room for: some 0.025 bytes each, with errors at half the size. */
+/* Pixels that a report of 60 MB has room for: some 0.02 bytes each, errors and base64 with them. */
 static size_t tile_width(const dar_eval *v)
 {
     static const size_t width[] = { 320, 288, 256, 224, 192, 160, 128, 96 };
@@ -103,7 +103,7 @@ static size_t tile_width(const dar_eval *v)
             double w = v->clip[c].width < width[i] ? (double)v->clip[c].width : (double)width[i];
             pixels += frames * w * w * (double)v->clip[c].height / (double)v->clip[c].width * (double)v->methods;
         }
-        if (pixels < 1.6e9) return width[i];
+        if (pixels < 2.4e9) return width[i];
     }
     return width[DAR_COUNT(width) - 1];
 }
