@@ -31,6 +31,9 @@ dar_val *dar_gelu_tanh(dar_tape *t, dar_val *x);
 /* y = max(x, 0), elementwise; the slope at 0 is 0. */
 dar_val *dar_relu(dar_tape *t, dar_val *x);
 
+/* y = e^x, elementwise. */
+dar_val *dar_exp(dar_tape *t, dar_val *x);
+
 /* ---------------------------------------------------------------- norms and what surrounds them */
 
 /* Variations of norms. */
@@ -252,6 +255,14 @@ dar_val *dar_mean(dar_tape *t, dar_val *x, unsigned dims, bool keep);
  *   w           broadcasts to it; frozen; NULL: 1
  *   y           scalar, f32, or f64 where x is; summed in f64 */
 dar_val *dar_squared_error(dar_tape *t, dar_val *x, dar_val *target, dar_val *w, bool as_mean);
+
+/* y = mean of sqrt((x - target)^2 + eps^2), eps > 0: |x - target| with a round corner.
+ *
+ *   x, target   of one shape
+ *   y           scalar, f32, or f64 where x is; summed in f64
+ *
+ * Source: Charbonnier et al. 1994, table 1. */
+dar_val *dar_charbonnier(dar_tape *t, dar_val *x, dar_val *target, double eps);
 
 /* y = exp(x + mask) / sum of it, along the last dimension.  mask broadcasts to x's shape; frozen; NULL: 0.  A row that
  * is -inf throughout gives zeros and zero gradients. */
