@@ -96,6 +96,9 @@ static void read_vae(dar_vae_config *c, dar_json j, int64_t latent)
     c->encoder_blocks = dar_json_int(j, "encoder_blocks", 2, 1, DAR_VAE_BLOCKS);
     c->decoder_blocks = dar_json_int(j, "decoder_blocks", 3, 1, DAR_VAE_BLOCKS);
 
+    c->linear = dar_json_bool(j, "linear", false);
+    if (c->linear && dar_vae_shrink_time(c) > 8)
+        dar_json_reject(j, "linear", "false where more than 8 frames become one");
     c->latent = latent;
     for (i = 0; i < DAR_VAE_LATENT; i++) c->mean[i] = 0, c->std[i] = 1;
     if (latent > DAR_VAE_LATENT) {

@@ -31,6 +31,8 @@
  *   vae.decoder_width  1 ..            256
  *   vae.encoder_blocks 1 .. 8          2        residual blocks per level
  *   vae.decoder_blocks 1 .. 8          3
+ *   vae.linear         bool            false    a linear map of every block of pixels to its latent and back, added to
+ *                                               what the networks give: small ones learn the rest sooner
  *   vae.mean, vae.std  lists           0, 1     per latent channel: the transformer sees (z - mean) / std
  *
  *   taew               object          public   of the tiny decoder of the same latent, for previews
@@ -100,6 +102,7 @@ typedef struct dar_vae_config {
     int64_t latent, patch;
     int64_t multipliers[DAR_VAE_LEVELS];
     bool halve_time[DAR_VAE_LEVELS];
+    bool linear;
     int64_t encoder_width, decoder_width, encoder_blocks, decoder_blocks;
     double mean[DAR_VAE_LATENT], std[DAR_VAE_LATENT];
 } dar_vae_config;

@@ -167,6 +167,12 @@ void dar_vae_init(dar_vae *v, dar_params *p, const dar_vae_config *c)
     v->moments = point(&m, "conv1", 2 * c->latent, 2 * c->latent);
     v->post = point(&m, "conv2", c->latent, c->latent);
     decoder(v, p);
+    if (c->linear) {
+        const int64_t r = dar_vae_shrink(c), block = 3 * r * r * dar_vae_shrink_time(c);
+        set_prefix(&m, "linear.");
+        v->linear[DAR_VAE_ENCODER] = point(&m, "encode", 2 * c->latent, block);
+        v->linear[DAR_VAE_DECODER] = point(&m, "decode", block, c->latent);
+    }
     DAR_ASSERT(v->encoder.slots <= DAR_VAE_SLOTS && v->decoder.slots <= DAR_VAE_SLOTS, "vae: %d slots, at most %d",
                v->decoder.slots, DAR_VAE_SLOTS);
     v->mean = per_channel(p, c->latent, c->mean);
@@ -174,6 +180,76 @@ void dar_vae_init(dar_vae *v, dar_params *p, const dar_vae_config *c)
     double rate[DAR_VAE_LATENT];
     for (int64_t i = 0; i < c->latent; i++) rate[i] = 1 / c->std[i];
     v->rate = per_channel(p, c->latent, rate);
+}
+
+/* ---------------------------------------------------------------- a place to learn from */
+
+#define NARROW (-6) /* log-variance */
+#define COMMON 2.4  /* deviation of the coefficient of cost 1, of pixels in [-1, 1]; of cost c: 1 / c of it */
+#define CHROMA 3    /* cost of a colour difference, in those of brightness */
+
+/* One wave over s frames of r x r pixels and the colours, orthonormal. */
+struct wave {
+    int64_t t, y, x, colour;
+    double cost;
+};
+
+static double cosine(int64_t k, int64_t n, int64_t at)
+{
+    return cos(acos(-1) * ((double)at + 0.5) * (double)k / (double)n) * sqrt((k ? 2.0 : 1.0) / (double)n);
+}
+
+/* The next one in the order of cost, then of number; of cost 0 before the first. */
+static struct wave next_wave(int64_t s, int64_t r, struct wave last)
+{
+    struct wave best = { 0 };
+    bool passed = last.cost == 0; /* `last` itself, among those of its cost */
+    for (int64_t i = 0; i < s * r * r * 3; i++) {
+        struct wave w = { i / (3 * r * r), i / (3 * r) % r, i / 3 % r, i % 3, 0 };
+        w.cost = (double)((1 + w.t * w.t + w.y * w.y + w.x * w.x) * (w.colour ? CHROMA : 1));
+        bool after = w.cost > last.cost || (w.cost == last.cost && passed);
+        if (after && (best.cost == 0 || w.cost < best.cost)) best = w;
+        if (w.t == last.t && w.y == last.y && w.x == last.x && w.colour == last.colour) passed = true;
+    }
+    return best;
+}
+
+/* Row k of the encoder's map and column k of the decoder's. */
+static void write_wave(const dar_vae *v, int64_t k, const struct wave *w)
+{
+    static const double colour[3][3] = { { 1, 1, 1 }, { 1, 0, -1 }, { 1, -2, 1 } };
+    const int64_t s = dar_vae_shrink_time(&v->c), r = dar_vae_shrink(&v->c), C = v->c.latent, P = 3 * r * r * s;
+    const double scale = w->cost / COMMON, length[3] = { sqrt(3), sqrt(2), sqrt(6) };
+    const dar_tensor *to = &v->linear[DAR_VAE_ENCODER].w->x, *from = &v->linear[DAR_VAE_DECODER].w->x;
+    for (int64_t i = 0; i < P; i++) { /* as frame_unshuffle of pixel_unshuffle numbers them */
+        int64_t c = i / (r * r) % 3;
+        double x = cosine(w->t, s, i / (3 * r * r)) * cosine(w->y, r, i / r % r) * cosine(w->x, r, i % r) *
+                   colour[w->colour][c] / length[w->colour];
+        dar_dtype_set(to->dtype, to->data, (size_t)(k * P + i), x * scale);
+        dar_dtype_set(from->dtype, from->data, (size_t)(i * C + k), x / scale);
+    }
+}
+
+static void clear(const dar_vae_conv *c)
+{
+    dar_tensor_fill(&c->w->x, 0);
+    dar_tensor_fill(&c->b->x, 0);
+}
+
+void dar_vae_start(dar_vae *v)
+{
+    const int64_t s = dar_vae_shrink_time(&v->c), r = dar_vae_shrink(&v->c), C = v->c.latent;
+    dar_tensor *b = &v->moments.b->x;
+    clear(&v->moments);
+    for (int64_t i = C; i < 2 * C; i++) dar_dtype_set(b->dtype, b->data, (size_t)i, NARROW);
+    if (!v->c.linear) return;
+    struct wave w = { 0 };
+    clear(&v->decoder.last);
+    for (int i = 0; i < 2; i++) clear(&v->linear[i]);
+    for (int64_t k = 0; k < C && k < 3 * s * r * r; k++) {
+        w = next_wave(s, r, w);
+        write_wave(v, k, &w);
+    }
 }
 
 /* ---------------------------------------------------------------- folded up-sampling */

@@ -101,12 +101,18 @@ static dar_val *residual(dar_tape *t, void *arg, dar_val *const *in)
     return dar_add(t, h, r->shortcut.w ? causal(t, &a->p, &r->shortcut, in[0]) : in[0]);
 }
 
+/* A recompute segment, unless everything is to be kept. */
+static dar_val *segment(dar_tape *t, const dar_vae *v, dar_segment_fn *fn, void *arg, dar_val *x, dar_shape s)
+{
+    return t->recording && v->whole ? fn(t, arg, &x) : dar_segment(t, fn, arg, &x, 1, x->x.dtype, s);
+}
+
 static dar_val *residual_segment(dar_tape *t, const struct pass *p, const dar_vae_res *r, dar_val *x)
 {
     struct residual *a = dar_tape_store(t, &(struct residual){ *p, r }, sizeof *a);
     dar_shape s = x->x.shape;
     s.d[1] = r->conv[1].w->x.shape.d[0];
-    return dar_segment(t, residual, a, &x, 1, x->x.dtype, s);
+    return segment(t, p->v, residual, a, x, s);
 }
 
 struct attention {
@@ -140,7 +146,7 @@ static dar_val *middle(dar_tape *t, const struct pass *p, const dar_vae_half *h,
 {
     struct attention *a = dar_tape_store(t, &(struct attention){ p->v, h }, sizeof *a);
     x = residual_segment(t, p, &h->middle[0], x);
-    x = dar_segment(t, attention, a, &x, 1, x->x.dtype, x->x.shape);
+    x = segment(t, p->v, attention, a, x, x->x.shape);
     return residual_segment(t, p, &h->middle[1], x);
 }
 
@@ -191,15 +197,33 @@ static dar_val *encoder_part(dar_tape *t, const struct pass *p, int i, dar_val *
     return dar_cast(t, causal(t, p, &v->moments, x), v->main);
 }
 
+/* Blocks of pixels beside the encoder: frame 0 four times, then the rest, as for the rays of the condition. */
+static dar_val *linear_encode(dar_tape *t, const struct pass *p, dar_val *x, dar_val *moments)
+{
+    const dar_vae *v = p->v;
+    const int s = (int)dar_vae_shrink_time(&v->c);
+    dar_val *part[DAR_OP_IN];
+    if (!v->linear[DAR_VAE_ENCODER].w) return moments;
+    if (begins(p) && s > 1) {
+        for (int i = 0; i < s - 1; i++) part[i] = dar_slice(t, x, 2, 0, 1);
+        part[s - 1] = x;
+        x = dar_concat(t, part, s, 2);
+    }
+    x = dar_cast(t, dar_pixel_unshuffle(t, x, (int)dar_vae_shrink(&v->c), DAR_PIXELS_ROWS), v->storage);
+    x = causal(t, p, &v->linear[DAR_VAE_ENCODER], dar_frame_unshuffle(t, x, s));
+    return dar_add(t, moments, dar_cast(t, x, v->main));
+}
+
 dar_val *dar_vae_encode(dar_tape *t, const dar_vae *v, dar_val *x)
 {
+    dar_val *y = x;
     struct pass p = { .v = v };
     const int64_t *d = x->x.shape.d, r = dar_vae_shrink(&v->c), s = dar_vae_shrink_time(&v->c);
     DAR_ASSERT(x->x.shape.n == 5 && d[1] == 3 && (d[2] - 1) % s == 0 && d[3] % r == 0 && d[4] % r == 0,
                "vae: a clip of %lld frames, %lld x %lld, expected 1 + k %lld frames and sides that %lld divides",
                (long long)d[2], (long long)d[4], (long long)d[3], (long long)s, (long long)r);
-    for (int i = 0; i <= v->c.levels; i++) x = encoder_part(t, &p, i, x);
-    return x;
+    for (int i = 0; i <= v->c.levels; i++) y = encoder_part(t, &p, i, y);
+    return linear_encode(t, &p, x, y);
 }
 
 /* ---------------------------------------------------------------- up */
@@ -254,10 +278,14 @@ static dar_val *up_level_alone(dar_tape *t, const struct pass *p, const dar_vae_
     return dar_segment(t, up_level_of, &(struct level){ *p, l }, &x, 1, x->x.dtype, s);
 }
 
+static dar_val *restore(dar_tape *t, const dar_vae *v, dar_val *z)
+{
+    return dar_add(t, dar_mul(t, z, dar_leaf(t, v->std, NULL)), dar_leaf(t, v->mean, NULL));
+}
+
 static dar_val *decoder_begin(dar_tape *t, const struct pass *p, dar_val *z)
 {
     const dar_vae *v = p->v;
-    z = dar_add(t, dar_mul(t, z, dar_leaf(t, v->std, NULL)), dar_leaf(t, v->mean, NULL));
     dar_val *x = causal(t, p, &v->post, dar_cast(t, z, v->storage));
     return middle(t, p, &v->decoder, causal(t, p, &v->decoder.first, x));
 }
@@ -269,12 +297,26 @@ static dar_val *decoder_end(dar_tape *t, const struct pass *p, dar_val *x)
     return dar_pixel_shuffle(t, x, (int)v->c.patch, DAR_PIXELS_COLUMNS);
 }
 
+/* Pixels of latents z beside the decoder; NULL: none. */
+static dar_val *linear_decode(dar_tape *t, const struct pass *p, dar_val *z)
+{
+    const dar_vae *v = p->v;
+    const int s = (int)dar_vae_shrink_time(&v->c);
+    if (!v->linear[DAR_VAE_DECODER].w) return NULL;
+    dar_val *x = causal(t, p, &v->linear[DAR_VAE_DECODER], dar_cast(t, z, v->storage));
+    x = dar_frame_shuffle(t, x, s);
+    if (begins(p)) x = dar_slice(t, x, 2, s - 1, frames_of(x) - (s - 1));
+    return dar_pixel_shuffle(t, dar_cast(t, x, v->main), (int)dar_vae_shrink(&v->c), DAR_PIXELS_ROWS);
+}
+
 dar_val *dar_vae_decode(dar_tape *t, const dar_vae *v, dar_val *z)
 {
     struct pass p = { .v = v };
-    dar_val *x = decoder_begin(t, &p, z);
+    z = restore(t, v, z);
+    dar_val *x = decoder_begin(t, &p, z), *linear = linear_decode(t, &p, z);
     for (int i = 0; i < v->c.levels; i++) x = up_level(t, &p, &v->decoder.level[i], x);
-    return decoder_end(t, &p, x);
+    x = decoder_end(t, &p, x);
+    return linear ? dar_add(t, x, linear) : x;
 }
 
 /* ---------------------------------------------------------------- moments */
@@ -317,6 +359,7 @@ dar_val *dar_vae_encode_next(dar_vae_stream *s, dar_tape *t, dar_val *x)
     DAR_ASSERT(s->side == DAR_VAE_ENCODER && !t->recording, "vae: a stream of the decoder, or a tape that records");
     DAR_ASSERT(frames_of(x) == (s->pieces ? dar_vae_shrink_time(&s->v->c) : 1), "vae: a piece of %lld frames",
                (long long)frames_of(x));
+    dar_val *pixels = x;
     bool keep = s->skip && s->pieces > 0; /* the first piece has another shape */
     bool same = keep && keep_copy(s->arena, &s->pixels, &x->x);
     for (int i = 0; i <= s->v->c.levels; i++) {
@@ -332,6 +375,7 @@ dar_val *dar_vae_encode_next(dar_vae_stream *s, dar_tape *t, dar_val *x)
         if (keep) keep_copy(s->arena, &s->part[i], &x->x);
         else s->steady[i] = false;
     }
+    x = linear_encode(t, &(struct pass){ .v = s->v, .s = s }, pixels, x);
     s->pieces++;
     return x;
 }
@@ -358,7 +402,8 @@ dar_status dar_vae_decode_next(dar_vae_stream *s, dar_tape *t, dar_val *z, dar_v
         if (v->decoder.level[i].halve_time) last = i + 1;
 
     dar_tape_place begin = dar_tape_mark(t);
-    dar_val *x = decoder_begin(t, &p, z);
+    z = restore(t, v, z);
+    dar_val *x = decoder_begin(t, &p, z), *linear = linear_decode(t, &p, z);
     for (int i = 0; i < last; i++) x = up_level_alone(t, &p, &v->decoder.level[i], x);
     int64_t frames = frames_of(x), first = s->pieces ? 1 + (s->pieces - 1) * dar_vae_shrink_time(&v->c) : 0;
     dar_status status = DAR_OK;
@@ -367,6 +412,7 @@ dar_status dar_vae_decode_next(dar_vae_stream *s, dar_tape *t, dar_val *z, dar_v
         dar_val *y = dar_contiguous(t, dar_slice(t, x, 2, f, 1));
         for (int i = last; i < v->c.levels; i++) y = up_level_alone(t, &p, &v->decoder.level[i], y);
         y = decoder_end(t, &p, y);
+        if (linear) y = dar_add(t, y, dar_slice(t, linear, 2, f, 1));
         if (!t->arena->plan) dar_vae_clamp(&y->x);
         if (sink) status = sink(ctx, &y->x, first + f, e);
         dar_tape_reset(t, m);
