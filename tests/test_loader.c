@@ -3,6 +3,7 @@
 #include "tests/scratch.h"
 
 #include "data/bundle.h"
+#include "data/h5.h"
 #include "lib/log.h"
 #include "lib/safetensors_write.h"
 #include "models/encode.h"
@@ -554,6 +555,37 @@ static void test_damage(void **state)
     dar_cache_close(cache);
 }
 
+/* A sound file whose numbers are not those that its sums are of. */
+static void test_wrong_numbers(void **state)
+{
+    static float numbers[10 * F * 4 * 6];
+    char sum[2][DAR_SHA256_TEXT], whole[DAR_SHA256_TEXT], again[DAR_SHA256_TEXT];
+    static const char *const part[] = { "moments", "known" };
+    dar_h5 *f;
+    dar_err e;
+    (void)state;
+    dar_cache *cache = open_cache("wrong", &made);
+    fill(cache);
+    list(in_dir("wrong"));
+    ok(dar_sha256_file(listed.path[0], whole, &e), &e);
+    ok(dar_h5_open(&f, listed.path[0], &e), &e);
+    for (int k = 0; k < 2; k++) ok(dar_h5_get_text(f, part[k], "sha256", sum[k], sizeof sum[k], &e), &e);
+    dar_h5_close(f);
+    ok(dar_h5_create(&f, listed.path[0], &e), &e);
+    for (int k = 0; k < 2; k++) {
+        dar_h5_array a = { .type = DAR_H5_F32, .rank = 4, .dim = { k ? 5 : 10, F, H / 4, W / 4 } };
+        ok(dar_h5_make(f, part[k], &a, &e), &e);
+        ok(dar_h5_write(f, part[k], &a, 0, a.dim[0], numbers, &e), &e);
+        ok(dar_h5_put_text(f, part[k], "sha256", sum[k], &e), &e);
+    }
+    ok(dar_h5_commit(f, &e), &e);
+    dar_h5_close(f);
+    assert_int_equal(fill(cache).damaged, 1);
+    ok(dar_sha256_file(listed.path[0], again, &e), &e);
+    assert_string_equal(again, whole);
+    dar_cache_close(cache);
+}
+
 /* Another picture, another autoencoder, another way to multiply: nothing of it is taken. */
 static void test_what_changed_is_not_taken(void **state)
 {
@@ -620,6 +652,7 @@ int main(void)
         cmocka_unit_test(test_failures_reach_their_step),
         cmocka_unit_test(test_hit_equals_miss),
         cmocka_unit_test(test_damage),
+        cmocka_unit_test(test_wrong_numbers),
         cmocka_unit_test(test_what_changed_is_not_taken),
         cmocka_unit_test(test_filling_goes_on_where_it_stopped),
     };
