@@ -152,6 +152,47 @@ static void precisions(void **state)
     CHECK_NEAR("loss in bf16 against f32", most, 0, 1e-2);
 }
 
+static const char autoencoder[] =
+    "{\"model\": \"small\", \"train\": \"vae\", \"from_scratch\": true, \"data\": [\"clips\"],"
+    "\"output_dir\": \"vae\", \"mixed_precision\": \"f32\", \"learning_rate\": 0.005,"
+    "\"lr_warmup_steps\": 2, \"max_train_steps\": 40, \"train_batch_size\": 2, \"max_grad_norm\": 1,"
+    "\"checkpointing_steps\": 10, \"vae\": {\"frames\": 5, \"height\": 16, \"width\": 24},"
+    "\"validation\": {\"data\": [\"clips\"], \"steps\": 20}}";
+
+/* From nothing, on cuts of the clips; stopped and resumed; and a backbone learns on latents of what was learned. */
+static void an_autoencoder(void **state)
+{
+    (void)state;
+    double loss[64], least = INFINITY;
+    dar_json_doc *doc;
+    dar_err e;
+    double std[5] = { 0 };
+    run_write("vae.json", autoencoder, sizeof autoencoder - 1);
+    GOOD("vae.json", "--dry-run");
+    CHECK(strstr(ran.out, "parameters") && !run_is_there("vae"), "a dry run: %s", ran.out);
+    GOOD("vae.json");
+    CHECK(!strstr(ran.err, "warning") && strstr(ran.err, " dB over 3 clips"), "%s", ran.err);
+    assert_int_equal(losses("vae", loss, 64), 40);
+    for (int k = 30; k < 40; k++) least = fmin(least, loss[k]);
+    CHECK(least < 0.9 * loss[0], "the loss goes from %g to %g", loss[0], least);
+
+    GOOD("vae.json", SET("output_dir=vae-parts"), SET("max_train_steps=10"), "--threads", "1");
+    GOOD("vae.json", SET("output_dir=vae-parts"), SET("gradient_checkpointing=full"), "--resume", "auto");
+    run_same_file("vae/checkpoint-40/vae.safetensors", "vae-parts/checkpoint-40/vae.safetensors");
+    run_same_file("vae/checkpoint-40/optimizer.safetensors", "vae-parts/checkpoint-40/optimizer.safetensors");
+
+    CHECK(dar_json_open(&doc, "vae/checkpoint-40/model.json", &e) == DAR_OK, "%s", e.text);
+    dar_json_numbers(dar_json_object(dar_json_root(doc), "vae"), "std", std, 5);
+    dar_json_close(doc);
+    for (int k = 0; k < 5; k++) CHECK(std[k] > 0 && std[k] != 1, "deviation of channel %d: %g", k, std[k]);
+    GOOD("backbone.json", SET("model=vae/checkpoint-40"), SET("output_dir=upon"), SET("max_train_steps=2"));
+    GOOD("vae.json", SET("from_scratch=false"), SET("parts.vae=vae/checkpoint-40/vae.safetensors"),
+         SET("output_dir=vae-more"), SET("max_train_steps=1"));
+    BAD(2, "parts.vae", "vae.json", SET("from_scratch=false"), SET("output_dir=bad"));
+    BAD(2, "vae.frames", "vae.json", SET("vae.width=18"), SET("output_dir=bad"));
+    CHECK(!run_is_there("bad"), "what was refused left a directory");
+}
+
 static void refusals(void **state)
 {
     (void)state;
@@ -171,7 +212,8 @@ int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),  cmocka_unit_test(stopped_and_resumed),
-        cmocka_unit_test(interrupted), cmocka_unit_test(precisions), cmocka_unit_test(refusals),
+        cmocka_unit_test(interrupted), cmocka_unit_test(precisions), cmocka_unit_test(an_autoencoder),
+        cmocka_unit_test(refusals),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-train") || !run_find(bundler, argv[0], "dar-bundle") ||

@@ -80,6 +80,14 @@ static const row table[] = {
     { "text", "empty", TEXT, AT(text_empty), 0, 0, 0, NULL },
     { NULL, "posterior", CHOICE, AT(posterior), 0, 0, 0, posterior_names },
 
+    { "vae", "frames", INT, AT(vae_frames), 9, 0, 1 << 20, NULL },
+    { "vae", "height", INT, AT(vae_height), 64, 0, 1 << 20, NULL },
+    { "vae", "width", INT, AT(vae_width), 64, 0, 1 << 20, NULL },
+    { "vae", "round", NUMBER, AT(vae_round), 0.02, 0, 1e3, NULL },
+    { "vae", "edge", NUMBER, AT(vae_edge), 0, 0, 1e3, NULL },
+    { "vae", "kl", NUMBER, AT(vae_kl), 1e-5, 0, 1e3, NULL },
+    { "vae", "noise", NUMBER, AT(vae_noise), 0, 0, 1e3, NULL },
+
     { "validation", "steps", INT, AT(validate_every), 1000, 0, COUNT, NULL },
     { "validation", "clips", INT, AT(validate_clips), 4, 1, 1 << 20, NULL },
     { "validation", "sampler_steps", INT, AT(validate_steps), 20, 1, 1000, NULL },

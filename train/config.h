@@ -56,6 +56,12 @@
  *                                                          for a text left out, or none; null: no token
  *   posterior                    mean | sample    mean     of the autoencoder, for clean latents
  *
+ *   vae.frames, .height, .width  0 ..         9, 64, 64  what is cut out of clips to train the autoencoder; 0: all
+ *   vae.round                    >= 0             0.02     of its distance's corner; 0: squares (train/vae_step.h)
+ *   vae.edge                     >= 0             0        weight of the distance of slopes
+ *   vae.kl                       >= 0             1e-5     weight of the divergence
+ *   vae.noise                    >= 0             0        added to latents before they are decoded
+ *
  *   validation.data              list of texts    []       bundles to look at while training
  *   validation.steps             0 ..             1000     every so many steps; 0: never
  *   validation.clips             1 ..             4        at most so many of them are sampled
@@ -116,6 +122,9 @@ typedef struct dar_train_config {
     double text_dropout;
     const char *text_empty;
     int posterior; /* 0: mean, 1: sample */
+
+    int64_t vae_frames, vae_height, vae_width;
+    double vae_round, vae_edge, vae_kl, vae_noise;
 
     int64_t validate_every, validate_clips, validate_steps, sensitivity;
 

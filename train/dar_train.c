@@ -4,6 +4,7 @@
 #include "lib/log.h"
 #include "lib/program.h"
 #include "train/trainer.h"
+#include "train/vae_trainer.h"
 
 static struct {
     dar_arg_list set;
@@ -92,23 +93,40 @@ static void print_plan(dar_json_writer *w, const dar_train_config *c, const dar_
     dar_json_write_end(w);
 }
 
+static dar_status train_transformer(dar_run *r, const dar_train_config *c, const dar_trainer_options *how, dar_err *e)
+{
+    dar_trainer *t;
+    dar_status s = dar_trainer_open(&t, c, how, e);
+    if (s != DAR_OK) return s;
+    print_plan(&r->json, c, &t->plan);
+    if (how->plan) say_plan(r, c, &t->plan);
+    else s = dar_trainer_run(t, e);
+    dar_trainer_close(t);
+    return s;
+}
+
+static dar_status train_vae(dar_run *r, const dar_train_config *c, const dar_trainer_options *how, dar_err *e)
+{
+    dar_vae_trainer *t;
+    dar_status s = dar_vae_trainer_open(&t, c, how, e);
+    if (s != DAR_OK) return s;
+    print_plan(&r->json, c, &t->plan);
+    if (how->plan) say_plan(r, c, &t->plan);
+    else s = dar_vae_trainer_run(t, e);
+    dar_vae_trainer_close(t);
+    return s;
+}
+
 static dar_status train(dar_run *r, dar_err *e)
 {
-    dar_trainer_options how = { .resume = o.resume, .plan = o.common.dry_run };
+    const dar_trainer_options how = { .resume = o.resume, .plan = o.common.dry_run };
     dar_train_config c;
-    dar_trainer *t = NULL;
     DAR_TRY(open_config(&c, r, e));
-    dar_status s = dar_trainer_open(&t, &c, &how, e);
-    if (s == DAR_OK) {
-        print_plan(&r->json, &c, &t->plan);
-        if (o.common.dry_run) say_plan(r, &c, &t->plan);
-        else s = dar_trainer_run(t, e);
-    }
-    if (s == DAR_OK && !o.common.dry_run) {
+    dar_status s = c.what == DAR_TRAIN_VAE ? train_vae(r, &c, &how, e) : train_transformer(r, &c, &how, e);
+    if (s == DAR_OK && !how.plan) {
         dar_run_say(r, "%s: %lld steps done", c.output, (long long)c.steps);
         dar_json_write_text(&r->json, "run", c.output);
     }
-    dar_trainer_close(t);
     dar_train_config_close(&c);
     return s;
 }

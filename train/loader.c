@@ -370,7 +370,7 @@ static void make_slot(dar_loader *l, struct slot *slot)
         const int64_t channels = DAR_RAYS_CHANNELS + (int64_t)c->condition->set.channels;
         s.b.cond = push(l, DAR_SHAPE(B, channels, (int64_t)dar_rays_latent_frames(l->frames), l->height, l->width));
     }
-    if (c->pixels) s.b.pixels = push(l, DAR_SHAPE(B, 3, c->frames, c->height, c->width));
+    if (c->pixels) s.b.pixels = push(l, dar_loader_pixels(l));
     s.b.count = s.count;
     s.b.path = s.path;
     s.b.clip = s.clip;
@@ -450,6 +450,11 @@ void dar_loader_close(dar_loader *l)
     dar_arena_free(&l->arena);
     dar_arena_free(&l->scratch);
     free(l);
+}
+
+dar_shape dar_loader_pixels(const dar_loader *l)
+{
+    return DAR_SHAPE(l->c.batch, 3, l->c.frames, l->c.height, l->c.width);
 }
 
 int64_t dar_loader_words(const dar_loader *l)

@@ -62,9 +62,11 @@ void dar_loader_close(dar_loader *l); /* accepts NULL */
 /* The batch of a step, valid until the next call.  Steps in order are read ahead; any other may be asked for. */
 dar_status dar_loader_get(dar_loader *l, int64_t step, const dar_batch **b, dar_err *e);
 
-int64_t dar_loader_words(const dar_loader *l);    /* most tokens of a text: size of batches' texts at most */
-size_t dar_loader_bytes(const dar_loader *l);     /* of memory, all batches together */
-double dar_loader_waited(const dar_loader *l);    /* [s] in dar_loader_get, so far */
+dar_shape dar_loader_pixels(
+    const dar_loader *l);                      /* [B, 3, frames, height, width]; of the whole clip if not asked for */
+int64_t dar_loader_words(const dar_loader *l); /* most tokens of a text: size of batches' texts at most */
+size_t dar_loader_bytes(const dar_loader *l);  /* of memory, all batches together */
+double dar_loader_waited(const dar_loader *l); /* [s] in dar_loader_get, so far */
 dar_shape dar_loader_latent(const dar_loader *l); /* [B, C, F, h, w]; n = 0 without cache */
 
 /* Numbers of the clips of an epoch, in order. */

@@ -68,9 +68,10 @@ static dar_status init_optim(dar_trainer *t, dar_err *e)
 
 /* ---------------------------------------------------------------- planning */
 
-static size_t memory_of_machine(void)
+size_t dar_trainer_budget(const dar_train_config *c)
 {
     long pages = sysconf(_SC_PHYS_PAGES), size = sysconf(_SC_PAGE_SIZE);
+    if (c->budget > 0) return (size_t)(c->budget * 1e9);
     return pages > 0 && size > 0 ? dar_mul_size((size_t)pages, (size_t)size) : 0;
 }
 
@@ -110,7 +111,7 @@ static dar_status plan_step(dar_trainer *t, dar_err *e)
 /* Everything on planning arenas; closes what it opened. */
 static dar_status plan(dar_trainer *t, dar_err *e)
 {
-    t->plan.budget = t->c->budget > 0 ? (size_t)(t->c->budget * 1e9) : memory_of_machine();
+    t->plan.budget = dar_trainer_budget(t->c);
     t->plan.peak = dar_rate((dar_dtype)t->c->storage);
     DAR_TRY(open_model(t, true, e));
     count_parameters(t);

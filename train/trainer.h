@@ -50,6 +50,9 @@ typedef struct dar_trainer {
 dar_status dar_trainer_open(dar_trainer **out, const dar_train_config *c, const dar_trainer_options *o, dar_err *e);
 void dar_trainer_close(dar_trainer *t); /* accepts NULL */
 
+/* Bytes that the configuration allows, or that the machine has. */
+size_t dar_trainer_budget(const dar_train_config *c);
+
 /* Bytes planned, all together. */
 size_t dar_trainer_bytes(const dar_trainer_plan *p);
 

@@ -86,15 +86,34 @@ static void backward(dar_vae_step *s, dar_val *loss)
     dar_backward(&s->tape, mean, NULL);
 }
 
+struct looked {
+    dar_val *pixels, *mean, *log_variance;
+};
+
+static struct looked look(dar_vae_step *s, const dar_tensor *x)
+{
+    dar_tape *t = &s->tape;
+    dar_val *moments = dar_vae_encode(t, s->v, dar_leaf(t, *x, NULL));
+    dar_val *mean = dar_contiguous(t, dar_vae_mean(t, s->v, moments));
+    return (struct looked){ dar_vae_decode(t, s->v, dar_vae_normalise(t, s->v, mean)), mean,
+                            dar_vae_log_variance(t, s->v, moments) };
+}
+
 static void plan(dar_vae_step *s, dar_shape shape)
 {
-    begin(s, true);
+    begin(s, s->c.parts > 0);
     dar_val *x = dar_input(&s->tape, s->v->main, shape);
-    struct loss l = forward(s, &x->x, 0);
-    s->forward = s->tape.cost.forward;
-    backward(s, l.total);
-    s->forward += s->tape.cost.forward - s->forward;
-    s->backward = s->tape.cost.backward;
+    if (s->c.parts > 0) {
+        struct loss l = forward(s, &x->x, 0);
+        backward(s, l.total);
+        s->forward = s->tape.cost.forward;
+        s->backward = s->tape.cost.backward;
+        begin(s, false); /* it may be looked at, too */
+        x = dar_input(&s->tape, s->v->main, shape);
+    }
+    struct looked l = look(s, &x->x);
+    distance(&s->tape, &s->c, l.pixels, x);
+    divergence(&s->tape, l.mean, l.log_variance);
 }
 
 dar_status dar_vae_step_init(dar_vae_step *s, dar_vae *v, const dar_vae_loss *c, dar_shape pixels, bool plans,
@@ -180,15 +199,13 @@ static void add_sums(const dar_tensor *z, dar_vae_sums *sums)
 
 dar_vae_report dar_vae_step_look(dar_vae_step *s, const dar_tensor *x, dar_vae_sums *sums)
 {
-    dar_tape *t = &s->tape;
     begin(s, false);
-    dar_val *pixels = dar_leaf(t, *x, NULL), *moments = dar_vae_encode(t, s->v, pixels);
-    dar_val *mean = dar_contiguous(t, dar_vae_mean(t, s->v, moments));
-    dar_val *y = dar_vae_decode(t, s->v, dar_vae_normalise(t, s->v, mean));
-    dar_vae_clamp(&y->x);
-    if (sums) add_sums(&mean->x, sums);
-    dar_vae_report r = { .distance = value(distance(t, &s->c, y, pixels)), .square = mean_square(x, &y->x) };
-    r.kl = value(divergence(t, mean, dar_vae_log_variance(t, s->v, moments)));
+    struct looked l = look(s, x);
+    dar_vae_clamp(&l.pixels->x);
+    if (sums) add_sums(&l.mean->x, sums);
+    dar_vae_report r = { .square = mean_square(x, &l.pixels->x) };
+    r.distance = value(distance(&s->tape, &s->c, l.pixels, dar_leaf(&s->tape, *x, NULL)));
+    r.kl = value(divergence(&s->tape, l.mean, l.log_variance));
     r.loss = r.distance + s->c.kl * r.kl;
     return r;
 }

@@ -17,7 +17,7 @@
 typedef struct dar_vae_loss {
     double round, edge, kl, noise;
     uint64_t seed;
-    int64_t parts; /* batches whose gradients become one step */
+    int64_t parts; /* batches whose gradients become one step; 0: they are only looked at */
 } dar_vae_loss;
 
 typedef struct dar_vae_step {
