@@ -2,11 +2,12 @@
  * to videos; interrupted, resumed, any number of threads; what is wrong in one line. */
 #include "tests/small.h"
 
+#include "data/condition.h"
+#include "data/pictures.h"
 #include "lib/json.h"
 #include "lib/safetensors_write.h"
 #include "models/config.h"
 #include "models/vae.h"
-#include "data/condition.h"
 
 #define CLIPS 3
 
@@ -63,6 +64,15 @@ static void same_state(const char *a, const char *b)
         snprintf(y, sizeof y, "%s/%s", b, files[i]);
         run_same_file(x, y);
     }
+}
+
+static void same_picture(const char *a, const char *b)
+{
+    enum { W = 40, H = 24 };
+    uint8_t rgb[2][3 * W * H];
+    dar_err e;
+    for (int i = 0; i < 2; i++) CHECK(dar_pictures_load(i ? b : a, W, H, rgb[i], &e) == DAR_OK, "%s", e.text);
+    CHECK(memcmp(rgb[0], rgb[1], sizeof rgb[0]) == 0, "%s and %s differ", a, b);
 }
 
 /* ---------------------------------------------------------------- tests, in order */
@@ -193,6 +203,20 @@ static void an_autoencoder(void **state)
     CHECK(!run_is_there("bad"), "what was refused left a directory");
 }
 
+/* The checkpoint and the weights that it was merged into are one model: every bit of the last frame. */
+static void merged(void **state)
+{
+    (void)state;
+    static const char *const models[] = { "merge/checkpoint-5", "merge/merged" };
+    GOOD("lora.json", SET("output_dir=merge"), SET("max_train_steps=5"), SET("save_merged=true"));
+    for (int i = 0; i < 2; i++) {
+        int status = RUN_PROGRAM(sampler, "clips/a", "--model", models[i], "-o", i ? "from-merged" : "from-checkpoint",
+                                 "--steps", "1", "--no-mp4", "--precision", "f32");
+        CHECK(status == 0, "%s: %s", models[i], ran.err);
+    }
+    same_picture("from-merged/frames/00008.png", "from-checkpoint/frames/00008.png");
+}
+
 static void refusals(void **state)
 {
     (void)state;
@@ -213,6 +237,7 @@ int main(int argc, char **argv)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),  cmocka_unit_test(stopped_and_resumed),
         cmocka_unit_test(interrupted), cmocka_unit_test(precisions), cmocka_unit_test(an_autoencoder),
+        cmocka_unit_test(merged),
         cmocka_unit_test(refusals),
     };
     (void)argc;

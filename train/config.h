@@ -42,7 +42,7 @@
  *   prefetch                     0 ..             2        batches read ahead
  *   checkpointing_steps          0 ..             2000     0: only at the end
  *   checkpoints_total_limit      1 ..             5
- *   save_merged                  bool             false    dit.safetensors beside the last checkpoint: additions merged
+ *   save_merged                  bool             false    RUN/merged: additions and adapter put into the weights
  *
  *   loss.shift                   > 0              5        of the table of sigmas
  *   loss.density                 uniform | logit_normal | mode | cosmap   uniform   how they are drawn

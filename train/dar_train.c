@@ -3,6 +3,7 @@
 
 #include "lib/log.h"
 #include "lib/program.h"
+#include "train/merge.h"
 #include "train/trainer.h"
 #include "train/vae_trainer.h"
 
@@ -93,6 +94,18 @@ static void print_plan(dar_json_writer *w, const dar_train_config *c, const dar_
     dar_json_write_end(w);
 }
 
+/* The run is done: RUN/merged stands by itself. */
+static dar_status merge(const dar_train_config *c, dar_err *e)
+{
+    char checkpoint[PATH_MAX + 32], out[PATH_MAX];
+    if (!c->save_merged || c->what != DAR_TRAIN_LORA) return DAR_OK;
+    snprintf(checkpoint, sizeof checkpoint, "%s/checkpoint-%lld", c->output, (long long)c->steps);
+    snprintf(out, sizeof out, "%.4000s/merged", c->output);
+    DAR_TRY(dar_merge(checkpoint, out, (dar_dtype)c->storage, e));
+    dar_log(DAR_LOG_INFO, "%s: additions and adapter merged into the weights", out);
+    return DAR_OK;
+}
+
 static dar_status train_transformer(dar_run *r, const dar_train_config *c, const dar_trainer_options *how, dar_err *e)
 {
     dar_trainer *t;
@@ -102,7 +115,7 @@ static dar_status train_transformer(dar_run *r, const dar_train_config *c, const
     if (how->plan) say_plan(r, c, &t->plan);
     else s = dar_trainer_run(t, e);
     dar_trainer_close(t);
-    return s;
+    return s == DAR_OK && !how->plan ? merge(c, e) : s;
 }
 
 static dar_status train_vae(dar_run *r, const dar_train_config *c, const dar_trainer_options *how, dar_err *e)

@@ -4,6 +4,7 @@
 #include <math.h>
 #include <string.h>
 
+#include "lib/log.h"
 #include "lib/rng.h"
 
 /* ---------------------------------------------------------------- what is drawn
@@ -154,12 +155,17 @@ static dar_step_report report(const dar_step *s, const struct given *g, const da
 dar_step_report dar_step_run(dar_step *s, const dar_batch *b, int64_t step, int64_t part)
 {
     uint64_t first = (uint64_t)((step * s->c->accumulate + part) * b->z0.shape.d[0]);
+    double clock[4] = { dar_log_clock() };
     begin(s, true);
     struct given g = give(s, b, first, true);
+    clock[1] = dar_log_clock();
     dar_val *loss = loss_of(s, b, &g);
+    clock[2] = dar_log_clock();
     dar_step_report r = { 0 };
     if (!s->step.plan) r = report(s, &g, loss);
     dar_backward(&s->tape, loss, NULL);
+    clock[3] = dar_log_clock();
+    r.draw = clock[1] - clock[0], r.forward = clock[2] - clock[1], r.backward = clock[3] - clock[2];
     return r;
 }
 

@@ -57,8 +57,9 @@ dar_status dar_step_init(dar_step *s, const dar_train_config *c, dar_dit *m, dar
 void dar_step_free(dar_step *s); /* accepts a zeroed one */
 
 typedef struct dar_step_report {
-    double loss;  /* mean over the batch */
-    double sigma; /* likewise */
+    double loss;                    /* mean over the batch */
+    double sigma;                   /* likewise */
+    double draw, forward, backward; /* [s] */
 } dar_step_report;
 
 /* Forward and backward of batch `part` of a step; gradients are added to those of the parameters, so that after all
