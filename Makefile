@@ -51,7 +51,7 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
 .PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit bench-vae bench-weights
-.PHONY: ulp fuzz fuzz-run
+.PHONY: bench-train ulp fuzz fuzz-run
 .PHONY: deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -136,11 +136,12 @@ bench: deps ## speed of whole tasks, stage by stage: build/bench/data.csv
 	@mkdir -p build/bench
 	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_data --output=build/bench/data.csv
 
-bench-dit bench-vae: bench-%: deps
+bench-dit bench-vae bench-train: bench-%: deps
 	@$(MAKE) --no-print-directory $B/speed_$*
 	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_$* $(ARGS)
 bench-dit: ## the 5B network with random weights: one evaluation; 13 GB, minutes; ARGS="--layers 4 --rank 16"
 bench-vae: ## its autoencoder: 9 frames encoded and decoded; 4 GB, minutes; ARGS="--frames 1"
+bench-train: ## a training step of dar-tiny: seconds by stage, rate, memory; ARGS="--precision f32"
 
 WEIGHTS := build/bench/wan22-fun-5b.safetensors
 bench-weights: ## a file of random weights of the 5B network, 10.6 GB; bench-dit ARGS="--weights FILE" loads it
