@@ -340,8 +340,9 @@ dar_status dar_validator_open(dar_validator **out, const dar_train_config *c, co
     if (!v) return dar_fail(e, DAR_ERR_NOMEM, "validation: out of memory");
     v->c = c;
     v->m = m;
-    dar_status s = dar_clips_find(&v->clips, dar_train_config_list(c, "validation", "data"), e);
-    bool any = v->clips.n && c->validate_every;
+    dar_status s = DAR_OK;
+    if (c->validate_every) s = dar_clips_find(&v->clips, dar_train_config_list(c, "validation", "data"), e);
+    bool any = v->clips.n > 0;
     if (s == DAR_OK && any) s = open_clips(v, cache, latent, e);
     if (s == DAR_OK && any) *out = v;
     else dar_validator_close(v);
