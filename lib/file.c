@@ -44,6 +44,11 @@ void dar_file_map_close(dar_file_map *m)
     *m = (dar_file_map){ 0 };
 }
 
+void dar_file_map_rest(const dar_file_map *m)
+{
+    if (m->data) madvise((void *)(uintptr_t)m->data, m->size, MADV_DONTNEED);
+}
+
 static dar_status refused(const dar_file_out *o, int error, dar_err *e)
 {
     bool full = error == ENOSPC || error == EDQUOT || error == EFBIG;

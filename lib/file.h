@@ -20,6 +20,9 @@ dar_status dar_file_map_open(dar_file_map *m, const char *path, dar_err *e);
 /* Accepts a zeroed map. */
 void dar_file_map_close(dar_file_map *m);
 
+/* Give back the memory of what was read so far; it is read again when it is touched.  Accepts a zeroed map. */
+void dar_file_map_rest(const dar_file_map *m);
+
 /* A file being written under a temporary name in the same directory. */
 typedef struct dar_file_out {
     int fd; /* -1: closed */

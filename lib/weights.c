@@ -227,6 +227,11 @@ void dar_weights_close(dar_weights *s)
     free(s);
 }
 
+void dar_weights_rest(const dar_weights *s)
+{
+    for (size_t i = 0; s && i < s->files; i++) dar_file_map_rest(&s->file[i].map);
+}
+
 /* ---------------------------------------------------------------- look-up */
 
 size_t dar_weights_count(const dar_weights *s)

@@ -51,6 +51,9 @@ dar_status dar_weights_parse(dar_weights **out, const char *name, const void *da
 
 void dar_weights_close(dar_weights *s); /* accepts NULL; tensors and entries end with it */
 
+/* Give back the memory of what was read of the files so far; it is read again when it is touched. */
+void dar_weights_rest(const dar_weights *s); /* accepts NULL */
+
 /* All tensors, in the order of files and, in each, of offsets (torch: of the dict); i < count. */
 size_t dar_weights_count(const dar_weights *s);
 const dar_weight *dar_weights_at(const dar_weights *s, size_t i);

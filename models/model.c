@@ -225,6 +225,7 @@ static dar_status build(dar_model *m, const dar_model_options *o, dar_arena *scr
     if (o->eight) quantise(m, scratch);
     dar_vae_fold(&m->vae, &m->weights);
     if (o->preview) dar_taew_prepare(&m->taew, &m->weights);
+    for (int i = 0; i < DAR_MODEL_PARTS; i++) dar_weights_rest(m->open[i]); /* what was copied need not stay */
     return DAR_OK;
 }
 

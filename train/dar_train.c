@@ -55,10 +55,12 @@ static void say_plan(dar_run *r, const dar_train_config *c, const dar_trainer_pl
     const dar_step_plan *s = &p->step[p->how];
     double seconds = p->flops / p->peak;
     dar_run_say(r, "parameters   %.2f M trained, %.2f M frozen", (double)p->trained / 1e6, (double)p->frozen / 1e6);
-    dar_run_say(
-        r, "memory       %.3f GB: weights and gradients %.3f, moments %.3f, a step %.3f, batches %.3f, validation %.3f",
-        gigabytes(dar_trainer_bytes(p)), gigabytes(p->weights), gigabytes(p->moments),
-        gigabytes(s->bytes[0] + s->bytes[1]), gigabytes(p->batches), gigabytes(p->validation));
+    dar_run_say(r,
+                "memory       %.3f GB: weights and gradients %.3f, moments %.3f, a step %.3f, batches %.3f, validation "
+                "%.3f, the program %.3f",
+                gigabytes(dar_trainer_bytes(p)), gigabytes(p->weights), gigabytes(p->moments),
+                gigabytes(s->bytes[0] + s->bytes[1]), gigabytes(p->batches), gigabytes(p->validation),
+                gigabytes(p->program));
     if (dar_trainer_bytes(p) > p->budget)
         dar_run_say(r, "             more than the %.3f GB that it may take: it would not start", gigabytes(p->budget));
     for (int k = DAR_RECOMPUTE_NONE; k <= DAR_RECOMPUTE_ALL; k++)
@@ -83,6 +85,7 @@ static void print_plan(dar_json_writer *w, const dar_train_config *c, const dar_
     dar_json_write_int(w, "step_bytes", (int64_t)(s->bytes[0] + s->bytes[1]));
     dar_json_write_int(w, "batch_bytes", (int64_t)p->batches);
     dar_json_write_int(w, "validation_bytes", (int64_t)p->validation);
+    dar_json_write_int(w, "program_bytes", (int64_t)p->program);
     dar_json_write_int(w, "bytes", (int64_t)dar_trainer_bytes(p));
     dar_json_write_int(w, "budget", (int64_t)p->budget);
     dar_json_write_text(w, "recompute", dar_recompute_name[p->how]);

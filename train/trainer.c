@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <unistd.h>
 
 #include "lib/log.h"
@@ -75,10 +76,16 @@ size_t dar_trainer_budget(const dar_train_config *c)
     return pages > 0 && size > 0 ? dar_mul_size((size_t)pages, (size_t)size) : 0;
 }
 
+size_t dar_trainer_program(void)
+{
+    struct rusage r;
+    return getrusage(RUSAGE_SELF, &r) == 0 ? 1024 * (size_t)r.ru_maxrss : 0;
+}
+
 size_t dar_trainer_bytes(const dar_trainer_plan *p)
 {
     const dar_step_plan *s = &p->step[p->how];
-    return p->weights + p->moments + p->batches + p->validation + s->bytes[0] + s->bytes[1];
+    return p->program + p->weights + p->moments + p->batches + p->validation + s->bytes[0] + s->bytes[1];
 }
 
 static void count_parameters(dar_trainer *t)
@@ -101,7 +108,7 @@ static dar_status plan_step(dar_trainer *t, dar_err *e)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found 1 frame, which is the reference itself: expected 5, 9, 13, ...",
                         t->clips.path[0]);
     DAR_TRY(dar_step_count(p->step, c, &t->m->dit, &size, e));
-    size_t rest = p->weights + p->moments + p->batches + p->validation;
+    size_t rest = p->program + p->weights + p->moments + p->batches + p->validation;
     p->how = dar_step_choose(c, p->step, p->budget > rest ? p->budget - rest : 0);
     p->tokens = (double)(z.d[0] * z.d[2] * (z.d[3] / d->patch) * (z.d[4] / d->patch) * c->accumulate);
     p->flops = (p->step[p->how].forward + p->step[p->how].backward) * (double)c->accumulate;
@@ -112,6 +119,7 @@ static dar_status plan_step(dar_trainer *t, dar_err *e)
 static dar_status plan(dar_trainer *t, dar_err *e)
 {
     t->plan.budget = dar_trainer_budget(t->c);
+    t->plan.program = dar_trainer_program();
     t->plan.peak = dar_rate((dar_dtype)t->c->storage);
     DAR_TRY(open_model(t, true, e));
     count_parameters(t);

@@ -24,6 +24,7 @@ typedef struct dar_trainer_options {
 typedef struct dar_trainer_plan {
     size_t trained, frozen;                       /* numbers */
     size_t weights, moments, batches, validation; /* [bytes]; weights: with gradients */
+    size_t program;                               /* [bytes] that it takes without all that */
     size_t budget;                                /* [bytes] it may take: what was said, else the machine's memory */
     dar_step_plan step[DAR_RECOMPUTE_ALL + 1];
     dar_recompute how;
@@ -50,8 +51,9 @@ typedef struct dar_trainer {
 dar_status dar_trainer_open(dar_trainer **out, const dar_train_config *c, const dar_trainer_options *o, dar_err *e);
 void dar_trainer_close(dar_trainer *t); /* accepts NULL */
 
-/* Bytes that the configuration allows, or that the machine has. */
+/* Bytes that the configuration allows, or that the machine has; that the program has taken so far. */
 size_t dar_trainer_budget(const dar_train_config *c);
+size_t dar_trainer_program(void);
 
 /* Bytes planned, all together. */
 size_t dar_trainer_bytes(const dar_trainer_plan *p);

@@ -130,6 +130,7 @@ static dar_status plan(dar_vae_trainer *t, dar_err *e)
 {
     dar_trainer_plan *p = &t->plan;
     p->budget = dar_trainer_budget(t->c);
+    p->program = dar_trainer_program();
     p->peak = dar_rate((dar_dtype)t->c->storage);
     DAR_TRY(open_network(t, true, e));
     DAR_TRY(init_optim(t, e));
