@@ -217,6 +217,24 @@ static void merged(void **state)
     same_picture("from-merged/frames/00008.png", "from-checkpoint/frames/00008.png");
 }
 
+/* The embedding of the empty prompt counts where a clip has no text. */
+static void empty_prompt(void **state)
+{
+    (void)state;
+    float words[2 * 13];
+    double without[4], with[4];
+    dar_err e;
+    for (size_t i = 0; i < DAR_COUNT(words); i++) words[i] = (float)(i % 7) - 3;
+    dar_safetensors_item item = { "text", dar_tensor_of(DAR_F32, DAR_SHAPE(2, 13), words) };
+    CHECK(dar_safetensors_write("empty.safetensors", &item, 1, NULL, &e) == DAR_OK, "%s", e.text);
+    GOOD("lora.json", SET("output_dir=without"), SET("max_train_steps=2"));
+    GOOD("lora.json", SET("output_dir=with"), SET("max_train_steps=2"), SET("text.empty=empty.safetensors"));
+    assert_int_equal(losses("without", without, 4), 2);
+    assert_int_equal(losses("with", with, 4), 2);
+    CHECK(without[0] != with[0], "both losses are %g", with[0]);
+    BAD(2, "small.bad", "lora.json", SET("output_dir=bad"), SET("text.empty=small.bad"));
+}
+
 static void refusals(void **state)
 {
     (void)state;
@@ -235,10 +253,9 @@ static void refusals(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),  cmocka_unit_test(stopped_and_resumed),
-        cmocka_unit_test(interrupted), cmocka_unit_test(precisions), cmocka_unit_test(an_autoencoder),
-        cmocka_unit_test(merged),
-        cmocka_unit_test(refusals),
+        cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),    cmocka_unit_test(stopped_and_resumed),
+        cmocka_unit_test(interrupted), cmocka_unit_test(precisions),   cmocka_unit_test(an_autoencoder),
+        cmocka_unit_test(merged),      cmocka_unit_test(empty_prompt), cmocka_unit_test(refusals),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-train") || !run_find(bundler, argv[0], "dar-bundle") ||

@@ -9,6 +9,7 @@
 
 #include "lib/log.h"
 #include "lib/program.h"
+#include "models/load.h"
 #include "models/rate.h"
 
 /* ---------------------------------------------------------------- opening */
@@ -47,6 +48,15 @@ static dar_status open_loader(dar_trainer *t, bool plan, dar_err *e)
     l.condition = t->m->dit.adapter.w ? &c->condition : NULL;
     l.posterior = c->posterior != 0;
     return dar_loader_open(&t->loader, &l, e);
+}
+
+/* What stands for no text. */
+static dar_status read_empty(dar_trainer *t, dar_err *e)
+{
+    const char *path = t->c->text_empty;
+    if (!path) return DAR_OK;
+    DAR_TRY(dar_weights_open(&t->empty, path, e));
+    return dar_load_text(&t->c->file.c.dit, t->empty, path, "text", &t->no_text, e);
 }
 
 static dar_status open_validator(dar_trainer *t, dar_err *e)
@@ -103,6 +113,7 @@ static dar_status plan_step(dar_trainer *t, dar_err *e)
     dar_shape z = dar_loader_latent(t->loader);
     dar_step_size size = { z.d[0], z.d[2], z.d[3], z.d[4], .pixels = dar_vae_shrink(&t->m->c.vae) };
     size.words = dar_loader_words(t->loader);
+    if (t->no_text.data && t->no_text.shape.d[1] > size.words) size.words = t->no_text.shape.d[1];
     if (t->m->dit.adapter.w) size.cond = t->m->c.adapter.rays + t->m->c.adapter.geometry;
     if (size.frames < 2)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found 1 frame, which is the reference itself: expected 5, 9, 13, ...",
@@ -214,6 +225,7 @@ static dar_status open_run(dar_trainer *t, const dar_trainer_options *o, dar_err
     DAR_TRY(fill_cache(t, &t->clips, e));
     if (t->validator) DAR_TRY(fill_cache(t, dar_validator_clips(t->validator), e));
     DAR_TRY(dar_step_init(&t->step, c, &t->m->dit, t->plan.how, &t->plan.step[t->plan.how], e));
+    t->step.empty = t->no_text;
     dar_journal_options j = { c->output, c->steps, t->plan.tokens, t->plan.flops, t->plan.peak };
     return dar_journal_open(&t->journal, &j, t->saver.step, e);
 }
@@ -226,6 +238,7 @@ dar_status dar_trainer_open(dar_trainer **out, const dar_train_config *c, const 
     t->c = c;
     dar_status s = dar_clips_find(&t->clips, dar_train_config_list(c, NULL, "data"), e);
     if (s == DAR_OK && !t->clips.n) s = dar_fail(e, DAR_ERR_USAGE, "data: found [], expected bundles to train on");
+    if (s == DAR_OK) s = read_empty(t, e);
     if (s == DAR_OK) s = plan(t, e);
     drop_plan(t);
     if (s == DAR_OK && !o->plan) s = open_run(t, o, e);
@@ -241,6 +254,7 @@ void dar_trainer_close(dar_trainer *t)
     dar_checkpoint_close(&t->saver);
     dar_step_free(&t->step);
     drop_plan(t);
+    dar_weights_close(t->empty);
     dar_clips_free(&t->clips);
     for (int i = 0; i < 2; i++) dar_json_writer_free(&t->text[i]);
     free(t);

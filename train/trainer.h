@@ -41,6 +41,8 @@ typedef struct dar_trainer {
     dar_arena moments;
     dar_optim optim;
     dar_step step;
+    dar_weights *empty; /* text.empty, which step.empty is of; or NULL */
+    dar_tensor no_text; /* of it */
     dar_checkpoint saver;
     dar_journal *journal;
     dar_validator *validator; /* NULL: nothing is validated */

@@ -120,7 +120,7 @@ static dar_status count_steps(dar_vae_trainer *t, dar_err *e)
         p->step[how] = (dar_step_plan){ { t->step.step.peak, 0 }, t->step.forward, t->step.backward };
         dar_vae_step_free(&t->step);
     }
-    size_t rest = p->weights + p->moments + p->batches + p->validation;
+    size_t rest = p->program + p->weights + p->moments + p->batches + p->validation;
     p->how = dar_step_choose(t->c, p->step, p->budget > rest ? p->budget - rest : 0);
     p->flops = (p->step[p->how].forward + p->step[p->how].backward) * (double)t->c->accumulate;
     return DAR_OK;
