@@ -119,6 +119,21 @@ static int make_temp(dar_dir_out *o)
 
 /* ---------------------------------------------------------------- writing */
 
+dar_status dar_dir_make(const char *path, dar_err *e)
+{
+    char part[PATH_MAX];
+    if (snprintf(part, sizeof part, "%s", path) >= (int)sizeof part)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", path);
+    for (char *p = part + 1; *p; p++) {
+        if (*p != '/') continue;
+        *p = 0;
+        if (mkdir(part, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", part, strerror(errno));
+        *p = '/';
+    }
+    if (mkdir(part, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", part, strerror(errno));
+    return DAR_OK;
+}
+
 dar_status dar_dir_create(dar_dir_out *o, const char *path, dar_err *e)
 {
     size_t length = strlen(path);

@@ -20,6 +20,9 @@ typedef struct dar_dir_out {
     char path[PATH_MAX], temp[PATH_MAX];
 } dar_dir_out;
 
+/* Make a directory, and those it lies in, where they are not there. */
+dar_status dar_dir_make(const char *path, dar_err *e);
+
 /* Make the temporary directory beside `path`.  From here to commit nothing touches `path`.  After a failure of any of
  * these the caller owes one dar_dir_discard. */
 dar_status dar_dir_create(dar_dir_out *o, const char *path, dar_err *e);

@@ -464,8 +464,13 @@ static void left_overs(void **state)
     run_free(&b);
     assert_int_equal(run_remove("left"), 0);
 
-    run_init(&a, "no/such", DAR_PARAM_LORA, DAR_F32, false, 1);
-    CHECK(dar_checkpoint_open(&a.c, &e) == DAR_ERR_IO && strstr(e.text, "no/such: No such file"), "%s", e.text);
+    run_init(&a, "in/the/way", DAR_PARAM_LORA, DAR_F32, false, 1); /* directories above are made, files stay */
+    open_run(&a);
+    dar_checkpoint_close(&a.c);
+    run_free(&a);
+    run_write("in/file", "x", 1);
+    run_init(&a, "in/file/run", DAR_PARAM_LORA, DAR_F32, false, 1);
+    CHECK(dar_checkpoint_open(&a.c, &e) == DAR_ERR_IO && strstr(e.text, "in/file/run: Not a directory"), "%s", e.text);
     run_free(&a);
 }
 

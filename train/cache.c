@@ -11,6 +11,7 @@
 
 #include "data/h5.h"
 #include "data/rays.h"
+#include "lib/dir.h"
 #include "lib/log.h"
 #include "lib/sha256.h"
 #include "models/encode.h"
@@ -297,7 +298,7 @@ dar_status dar_cache_fill(dar_cache *c, const char *const *path, size_t n, dar_s
     dar_progress progress = dar_progress_begin("latents", "clips", (double)n);
     dar_status s = DAR_OK;
     *r = (dar_cache_report){ 0 };
-    if (mkdir(c->dir, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", c->dir, strerror(errno));
+    DAR_TRY(dar_dir_make(c->dir, e));
     for (size_t i = 0; i < n && s == DAR_OK; i++) {
         s = dar_bundle_open(&encoder.b, path[i], e);
         if (s == DAR_OK) s = fill_clip(&encoder, path[i], r, e);

@@ -89,7 +89,7 @@ dar_status dar_checkpoint_open(dar_checkpoint *c, dar_err *e)
     DAR_ASSERT(c->keep >= 1, "checkpoint: %lld kept", (long long)c->keep);
     c->step = 0;
     c->lock = -1;
-    if (mkdir(c->run, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", c->run, strerror(errno));
+    DAR_TRY(dar_dir_make(c->run, e));
     int error = dar_file_flush_entry(c->run);
     if (error) return dar_fail(e, DAR_ERR_IO, "%s: %s", c->run, strerror(error));
     DAR_TRY(dar_dir_lock(&c->lock, c->run, e));

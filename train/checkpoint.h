@@ -28,7 +28,7 @@
 #include "train/optim.h"
 
 typedef struct dar_checkpoint {
-    const char *run;    /* directory; its parent exists */
+    const char *run;    /* directory */
     dar_params *params; /* with values */
     const dar_dit *dit; /* whose parameters they are, for alpha; NULL: of an autoencoder, written as vae */
     dar_optim *optim;   /* over the same parameters */
