@@ -17,6 +17,7 @@
 #include "lib/safetensors_write.h"
 #include "lib/weights.h"
 #include "models/dit.h"
+#include "models/lora.h"
 #include "models/taew.h"
 #include "models/vae.h"
 
@@ -107,6 +108,34 @@ static void write_model(const char *path)
     dar_params_free(&taew_params);
     dar_params_free(&dit_params);
     dar_params_free(&vae_params);
+    dar_arena_free(&a);
+}
+
+/* What training leaves: additions that are not zero, and the adapter beside them, which is the model's own. */
+static void write_trained(const char *path)
+{
+    dar_arena a;
+    dar_params p;
+    dar_dit dit = { 0 };
+    dar_config c;
+    dar_json_doc *doc;
+    dar_err e;
+    char name[64];
+    assert_int_equal(mkdir(path, 0777), 0);
+    assert_int_equal(dar_json_parse(&doc, "model", model, sizeof model - 1, &e), DAR_OK);
+    dar_config_read(&c, dar_json_root(doc));
+    dar_json_close(doc);
+    assert_int_equal(dar_arena_init(&a, "weights", 16 << 20, &e), DAR_OK);
+    dar_params_init(&p, &a, DAR_F32);
+    dar_dit_init(&dit, &p, &c.dit, &c.adapter);
+    dar_lora_init(&dit, &p, &(dar_lora_config){ .rank = 2, .alpha = 2, .targets = DAR_PROJECTIONS_ALL });
+    fill(&p);
+    snprintf(name, sizeof name, "%s/lora.safetensors", path);
+    CHECK(dar_lora_write(&dit, name, &e) == DAR_OK, "%s", e.text);
+    snprintf(name, sizeof name, "%s/adapter.safetensors", path);
+    assert_int_equal(symlink("../model/dit.safetensors", name), 0);
+    dar_dit_free(&dit);
+    dar_params_free(&p);
     dar_arena_free(&a);
 }
 
@@ -449,6 +478,21 @@ static void preview(void **state)
     GOOD("clip", "-o", "never", MODEL, "--preview", "--dry-run");
 }
 
+/* Additions matter; merged or apart they give the same, and merging is told as saved. */
+static void trained(void **state)
+{
+    (void)state;
+    write_trained("trained");
+    GOOD("clip", "-o", "l1", MODEL, "--reference", "a.png", "--lora", "trained", "--precision", "f64", "--json");
+    CHECK(printed_in("flops_saved", "lora") > 0, "%s", ran.out);
+    GOOD("clip", "-o", "l2", MODEL, "--reference", "a.png", "--lora", "trained", "--precision", "f64", "--no-skip",
+         "lora");
+    same_frames("l1", "l2");
+    assert_true(frames_differ("l1", "t1"));
+    GOOD("clip", "-o", "l3", MODEL, "--reference", "a.png", "--lora", "trained", "--precision", "int8");
+    BAD(2, "frames/lora.safetensors: No such", "clip", "-o", "x", MODEL, "--reference", "a.png", "--lora", "frames");
+}
+
 /* 8 bits change little; weights may be drawn; the latent is what frames are decoded from. */
 static void precisions(void **state)
 {
@@ -476,11 +520,6 @@ static void precisions(void **state)
     printf("note: int8 against bf16, latent of two blocks after two steps: %.1e\n", off);
     CHECK(off > 1e-6, "nothing is rounded");
     CHECK_NEAR("int8", off, 0, 0.05);
-
-    /* What was trained, as a directory: the adapter of this one is the model's own. */
-    assert_int_equal(mkdir("trained", 0777), 0);
-    assert_int_equal(symlink("../model/dit.safetensors", "trained/adapter.safetensors"), 0);
-    BAD(2, "trained/lora.safetensors: No such", "clip", "-o", "x", MODEL, "--reference", "a.png", "--lora", "trained");
 
     assert_int_equal(mkdir("bare", 0777), 0);
     run_write("bare/model.json", model, sizeof model - 1);
@@ -645,11 +684,11 @@ static int remove_directory(void **state)
 int main(int argc, char **argv)
 {
     static const struct CMUnitTest tests[] = {
-        cmocka_unit_test(a_video),    cmocka_unit_test(any_threads),       cmocka_unit_test(batches),
-        cmocka_unit_test(stopped),    cmocka_unit_test(ten_clips),         cmocka_unit_test(solvers_and_noise),
-        cmocka_unit_test(layers),     cmocka_unit_test(against_the_truth), cmocka_unit_test(preview),
-        cmocka_unit_test(precisions), cmocka_unit_test(windows),           cmocka_unit_test(dry_run),
-        cmocka_unit_test(refusals),
+        cmocka_unit_test(a_video), cmocka_unit_test(any_threads),       cmocka_unit_test(batches),
+        cmocka_unit_test(stopped), cmocka_unit_test(ten_clips),         cmocka_unit_test(solvers_and_noise),
+        cmocka_unit_test(layers),  cmocka_unit_test(against_the_truth), cmocka_unit_test(trained),
+        cmocka_unit_test(preview), cmocka_unit_test(precisions),        cmocka_unit_test(windows),
+        cmocka_unit_test(dry_run), cmocka_unit_test(refusals),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
     return cmocka_run_group_tests_name("dar-sample", tests, in_directory, remove_directory) != 0;
