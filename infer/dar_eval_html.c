@@ -71,6 +71,7 @@ static const char style[] =
     "figure{margin:0;border:1px solid "
     "var(--line);border-radius:10px;background:var(--card);padding:.8rem;overflow:hidden}\n"
     "figure svg{width:100%;height:auto;display:block}\n"
+    "@media(prefers-color-scheme:dark){figure svg{filter:invert(.89) hue-rotate(180deg)}}\n" /* plots are on white */
     ".clip{margin-top:2rem}.clip h3{margin:0 0 .5rem;font-size:1rem;font-weight:600;display:flex;gap:.7rem;"
     "align-items:baseline;flex-wrap:wrap}.clip h3 span{font-weight:400;color:var(--dim);font-size:.85rem}\n"
     ".film{position:relative;background:#141414;border-radius:10px;overflow:hidden;width:100%}\n"

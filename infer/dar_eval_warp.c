@@ -16,6 +16,7 @@
 
 #define BAND   16    /* rows of a task */
 #define WIDEST 4.f   /* a distance of neighbours counts up to so many times the usual one */
+#define FINEST 1e-6f /* the usual one, at least */
 #define LONELY 0.05f /* the usual one, of a pixel that has no neighbour, in cells of the cube */
 
 struct dar_eval_warp {
@@ -134,7 +135,7 @@ static bool measure_parts(dar_eval_warp *w)
     }
     bool ok = count && w->usual;
     for (size_t p = 0; ok && p < parts; p++)
-        if (count[p]) w->usual[p] /= (float)count[p];
+        if (count[p]) w->usual[p] = fmaxf(w->usual[p] / (float)count[p], FINEST);
     free(count);
     return ok;
 }
