@@ -312,7 +312,7 @@ static void test_study(void **state)
     assert_false(run_is_there("study/film.mp4"));
     bool differs = false;
     for (int seed = 2; seed < 10; seed++) {
-        char number[8], out[16], key[32];
+        char number[16], out[32], key[64];
         snprintf(number, sizeof number, "%d", seed);
         snprintf(out, sizeof out, "seed%d", seed);
         snprintf(key, sizeof key, "%s/study-key.json", out);
