@@ -162,7 +162,7 @@ lint: ## the quick half of check: layers, style, format, headers alone
 check: ## lint, then gcc, clang, debug and sanitizer builds, tests in release and under sanitizers
 	@scripts/check.sh
 
-stress: deps ## where numbers break, with tests that take gigabytes of memory; training killed 200 times
+stress: deps ## where numbers break, with tests that take gigabytes of memory; training killed 200 times, and long
 	@$(MAKE) --no-print-directory all $B/test_stress $B/test_kill
 	@$B/test_stress full
 	@$B/test_kill full

@@ -78,10 +78,9 @@ static past read_log(const char *run)
 {
     char path[PATH_MAX];
     past p = { .n = 0 };
-    size_t size;
     dar_err e;
     snprintf(path, sizeof path, "%s/log.jsonl", run);
-    ok(dar_journal_scan(path, note, &p, &size, &e), &e);
+    ok(dar_journal_scan(path, note, &p, &e), &e);
     return p;
 }
 

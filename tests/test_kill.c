@@ -1,5 +1,6 @@
 /* test_kill.c: dar-train killed at random moments, while saving too, and short of disk: it resumes with what it had
- * saved, and ends with the bits of a run that was left alone.  `test_kill full`, from make stress, kills 200 times. */
+ * saved, and ends with the bits of a run that was left alone; long runs.  `test_kill full`, from make stress, kills 200
+ * times and trains 100,000 steps. */
 #include "tests/small.h"
 
 #include <dirent.h>
@@ -80,10 +81,9 @@ static story read_log(const char *run)
 {
     char path[PATH_MAX];
     story s = { .started = -1 };
-    size_t size;
     dar_err e;
     snprintf(path, sizeof path, "%s/log.jsonl", run);
-    CHECK(dar_journal_scan(path, note, &s, &size, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_journal_scan(path, note, &s, &e) == DAR_OK, "%s", e.text);
     return s;
 }
 
@@ -181,6 +181,41 @@ static void disk_full(void **state)
     same_end("full", "whole-0");
 }
 
+/* ---------------------------------------------------------------- long runs */
+
+typedef struct growth {
+    int64_t steps, last;
+    double peak[2]; /* [bytes] after a third of the steps, at the end */
+} growth;
+
+static bool watch(void *ctx, const dar_journal_past *x)
+{
+    growth *g = ctx;
+    if (strcmp(x->kind, "step") != 0) return true;
+    CHECK(isfinite(x->loss) && isfinite(x->norm), "step %lld: loss %g, norm %g", (long long)x->step, x->loss, x->norm);
+    if (3 * x->step <= g->steps) g->peak[0] = x->peak_bytes;
+    g->peak[1] = x->peak_bytes;
+    g->last = x->step;
+    return true;
+}
+
+/* Losses stay numbers and memory what it is: a log that were kept, or mapped, would show. */
+static void no_growth(void **state)
+{
+    (void)state;
+    char steps[64], every[64];
+    growth g = { .steps = kills == 200 ? 100000 : 1500 };
+    dar_err e;
+    snprintf(steps, sizeof steps, "max_train_steps=%lld", (long long)g.steps);
+    snprintf(every, sizeof every, "checkpointing_steps=%lld", (long long)g.steps / 6);
+    int status =
+        RUN_PROGRAM(program, "lora.json", SET("output_dir=long"), SET(steps), SET(every), "--threads", "1", "--quiet");
+    CHECK(status == 0, "status %d: %s", status, ran.err);
+    CHECK(dar_journal_scan("long/log.jsonl", watch, &g, &e) == DAR_OK, "%s", e.text);
+    assert_int_equal(g.last, g.steps);
+    CHECK(g.peak[1] <= g.peak[0] + 1.3e5, "memory grew from %.0f to %.0f bytes", g.peak[0], g.peak[1]);
+}
+
 static int setup(void **state)
 {
     if (scratch_make(state) || chdir(scratch_dir)) return -1;
@@ -190,7 +225,8 @@ static int setup(void **state)
 
 int main(int argc, char **argv)
 {
-    static const struct CMUnitTest tests[] = { cmocka_unit_test(killed), cmocka_unit_test(disk_full) };
+    static const struct CMUnitTest tests[] = { cmocka_unit_test(killed), cmocka_unit_test(disk_full),
+                                               cmocka_unit_test(no_growth) };
     if (argc > 1 && strcmp(argv[1], "full") == 0) kills = 200;
     if (!run_find(program, argv[0], "dar-train") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
     return cmocka_run_group_tests_name("kill", tests, setup, scratch_remove) != 0;

@@ -18,7 +18,8 @@
 #include "lib/thread.h"
 #include "train/journal_inside.h"
 
-#define DRAW_SHARE 20 /* drawing takes at most one part of so many of the time */
+#define LINE_MOST  65536 /* bytes of a line; a longer one is none of ours */
+#define DRAW_SHARE 20    /* drawing takes at most one part of so many of the time */
 
 struct dar_journal {
     dar_journal_options o;
@@ -53,6 +54,7 @@ static bool read_line(const char *text, size_t size, dar_json_doc **doc, dar_jou
     x->norm = number_of(j, "norm");
     x->rate = number_of(j, "rate");
     x->seconds = number_of(j, "seconds");
+    x->peak_bytes = number_of(j, "peak_bytes");
     x->shuffled = number_of(j, "shuffled");
     x->psnr = number_of(j, "psnr");
     dar_json_accept(j);
@@ -60,25 +62,26 @@ static bool read_line(const char *text, size_t size, dar_json_doc **doc, dar_jou
     return dar_json_finish(*doc, NULL) == DAR_OK;
 }
 
-dar_status dar_journal_scan(const char *path, dar_journal_fn *fn, void *ctx, size_t *size, dar_err *e)
+/* By lines, not mapped: a log of many steps would count as memory of the program. */
+dar_status dar_journal_scan(const char *path, dar_journal_fn *fn, void *ctx, dar_err *e)
 {
-    dar_file_map m;
+    char line[LINE_MOST];
+    size_t at = 0;
     bool more = true;
-    *size = 0;
-    if (access(path, F_OK) != 0 && errno == ENOENT) return DAR_OK;
-    DAR_TRY(dar_file_map_open(&m, path, e));
-    *size = m.size;
-    for (size_t at = 0; more && at < m.size;) {
-        const char *text = (const char *)m.data + at, *end = memchr(text, '\n', m.size - at);
+    FILE *f = fopen(path, "rb");
+    if (!f) return errno == ENOENT ? DAR_OK : dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
+    while (more && fgets(line, sizeof line, f)) {
+        size_t size = strlen(line);
         dar_json_doc *doc = NULL;
         dar_journal_past x;
-        if (!end) break;
-        x.end = at = at + (size_t)(end - text) + 1;
-        more = read_line(text, (size_t)(end - text), &doc, &x) && fn(ctx, &x);
+        if (!size || line[size - 1] != '\n') break;
+        x.end = at += size;
+        more = read_line(line, size - 1, &doc, &x) && fn(ctx, &x);
         dar_json_close(doc);
     }
-    dar_file_map_close(&m);
-    return DAR_OK;
+    bool failed = ferror(f) != 0;
+    fclose(f);
+    return failed ? dar_fail(e, DAR_ERR_IO, "%s: cannot be read", path) : DAR_OK;
 }
 
 struct taking_up {
@@ -109,10 +112,9 @@ static dar_status refused(const dar_journal *j, int error, dar_err *e)
 static dar_status take_up_log(dar_journal *j, int64_t resumed, dar_err *e)
 {
     struct taking_up t = { j, resumed };
-    size_t size;
     if (snprintf(j->path, sizeof j->path, "%s/%s", j->o.run, DAR_JOURNAL_LOG) >= (int)sizeof j->path)
         return refused(j, ENAMETOOLONG, e);
-    if (resumed) DAR_TRY(dar_journal_scan(j->path, take_up, &t, &size, e));
+    if (resumed) DAR_TRY(dar_journal_scan(j->path, take_up, &t, e));
     j->fd = open(j->path, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0666);
     if (j->fd < 0 || ftruncate(j->fd, j->size) != 0 || fsync(j->fd) != 0) return refused(j, errno, e);
     int error = dar_file_flush_entry(j->path);

@@ -214,11 +214,10 @@ static dar_status draw_all(const char *run, table *t, dar_err *e)
                   { "loss_sigma.svg", draw_sigma },
                   { "psnr.svg", draw_psnr } };
     char path[PATH_MAX];
-    size_t size;
     snprintf(path, sizeof path, "%.4000s/%s", run, DAR_JOURNAL_LOG);
-    DAR_TRY(dar_journal_scan(path, count, t, &size, e));
+    DAR_TRY(dar_journal_scan(path, count, t, e));
     t->every = (t->steps + ROWS - 1) / ROWS + !t->steps;
-    DAR_TRY(dar_journal_scan(path, collect, t, &size, e));
+    DAR_TRY(dar_journal_scan(path, collect, t, e));
     for (size_t i = 0; i < DAR_COUNT(files); i++) {
         snprintf(path, sizeof path, "%.4000s/%s", run, files[i].name);
         DAR_TRY(files[i].make(t, path, e));

@@ -12,8 +12,8 @@
 typedef struct dar_journal_past {
     const char *kind;
     int64_t step;
-    double loss, smoothed, sigma, norm, rate, seconds; /* of steps */
-    double shuffled, psnr;                             /* of validation */
+    double loss, smoothed, sigma, norm, rate, seconds, peak_bytes; /* of steps */
+    double shuffled, psnr;                                         /* of validation */
     bool skipped;
     size_t end; /* offset behind it [bytes] */
 } dar_journal_past;
@@ -21,8 +21,8 @@ typedef struct dar_journal_past {
 /* Called for each whole line in order; false: no more. */
 typedef bool dar_journal_fn(void *ctx, const dar_journal_past *line);
 
-/* Read a log as far as it is whole; *size: of the file.  One that is not there is empty. */
-dar_status dar_journal_scan(const char *path, dar_journal_fn *fn, void *ctx, size_t *size, dar_err *e);
+/* Read a log as far as it is whole.  One that is not there is empty. */
+dar_status dar_journal_scan(const char *path, dar_journal_fn *fn, void *ctx, dar_err *e);
 
 /* Make loss.csv, loss.svg, loss_sigma.svg and psnr.svg of the log of a run. */
 dar_status dar_journal_draw(const char *run, dar_err *e);
