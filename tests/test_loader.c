@@ -16,6 +16,8 @@
 #define T      9
 #define F      3
 #define PIXELS ((size_t)W * H)
+#define WIDER  (W + 8) /* a clip that does not fit */
+#define MOST   ((size_t)WIDER * H)
 #define CLIPS  5
 #define WIDTH  7 /* of text */
 
@@ -42,8 +44,8 @@ struct shape {
 
 static void write_bundle(const char *path, int salt, const struct shape *s)
 {
-    static float tracking[3 * PIXELS], world[3 * PIXELS], depth[PIXELS];
-    static uint8_t mask[PIXELS], rgb[3 * PIXELS];
+    static float tracking[3 * MOST], world[3 * MOST], depth[MOST]; /* beyond PIXELS all 0 */
+    static uint8_t mask[MOST], rgb[3 * MOST];
     dar_gbuffer g = { .tracking = tracking, .world = world, .depth = depth, .mask = mask };
     dar_bundle_options o = dar_bundle_standard();
     dar_bundle_writer *w;
@@ -399,7 +401,7 @@ static void test_clips_that_do_not_fit(void **state)
         struct shape s;
         const char *says;
     } bad[] = {
-        { { W + 8, H, T, true, true }, "found 9 frames of 32 x 16, expected 9 of 24 x 16 as in" },
+        { { WIDER, H, T, true, true }, "found 9 frames of 32 x 16, expected 9 of 24 x 16 as in" },
         { { W, H, 5, true, true }, "found 5 frames" },
         { { W, H, T, false, true }, "has no pictures" },
         { { W, H, T, true, false }, "has no world" },
