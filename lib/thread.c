@@ -30,7 +30,9 @@ void dar_threads_set(int n)
 
 void dar_threads_restart(char *const argv[])
 {
-    if (getenv("OMP_WAIT_POLICY") || getenv("GOMP_SPINCOUNT")) return;
+    static const char *const said[] = { "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_PROC_BIND", "OMP_PLACES" };
+    for (size_t i = 0; i < DAR_COUNT(said); i++) /* bound to a processor, we would hand on that one alone */
+        if (getenv(said[i])) return;
     if (setenv("GOMP_SPINCOUNT", SPINS, 1) == 0) execv("/proc/self/exe", argv);
 }
 

@@ -17,7 +17,7 @@ void dar_threads_set(int n); /* n >= 1 */
 /* First thing in main: start the program again, so that threads which wait for each other soon sleep.  By itself OpenMP
  * lets them spin for milliseconds, which costs whoever wants the processors, this program's own threads among them, and
  * it reads how long before main.  Once: returns in the new program, where the environment says how long, or if it did
- * already (OMP_WAIT_POLICY, GOMP_SPINCOUNT), or if the system refuses. */
+ * already (OMP_WAIT_POLICY, GOMP_SPINCOUNT, OMP_PROC_BIND, OMP_PLACES), or if the system refuses. */
 void dar_threads_restart(char *const argv[]);
 
 /* Run fn(ctx, i, thread) for every i < tasks, in any order; thread < dar_threads() tells whose scratch to use.  Called
