@@ -7,7 +7,7 @@
 #include "lib/json.h"
 #include "lib/safetensors_write.h"
 #include "models/config.h"
-#include "models/vae.h"
+#include "models/model.h"
 
 #define CLIPS 3
 
@@ -217,6 +217,74 @@ static void merged(void **state)
     same_picture("from-merged/frames/00008.png", "from-checkpoint/frames/00008.png");
 }
 
+static dar_model *open_model(const char *path)
+{
+    dar_model_options o = { .storage = DAR_F32, .strength = 1, .apart = true };
+    dar_model_file f;
+    dar_model *m;
+    dar_err e;
+    CHECK(dar_model_file_open(&f, path, &e) == DAR_OK, "%s", e.text);
+    CHECK(dar_model_open(&m, &f, &o, &e) == DAR_OK, "%s", e.text);
+    dar_model_file_close(&f);
+    return m;
+}
+
+/* Every parameter of b is a's, matrices rounded to bf16. */
+static void same_rounded(const char *a, const char *b)
+{
+    dar_model *x = open_model(a), *y = open_model(b);
+    for (int k = 0; k < 2; k++) {
+        CHECK(x->params[k].count == y->params[k].count, "%s: %zu parameters, %s: %zu", a, x->params[k].count, b,
+              y->params[k].count);
+        for (size_t i = 0; i < x->params[k].count; i++) {
+            const dar_param *p = x->params[k].at[i], *q = dar_params_find(&y->params[k], p->name);
+            CHECK(q && dar_shape_equal(&p->x.shape, &q->x.shape), "%s is not there, or of another shape", p->name);
+            for (size_t n = 0; n < dar_shape_count(&p->x.shape); n++) {
+                double want = dar_dtype_get(DAR_F32, p->x.data, n), got = dar_dtype_get(DAR_F32, q->x.data, n);
+                uint16_t narrow;
+                if (p->info.matrix) dar_dtype_set(DAR_BF16, &narrow, 0, want);
+                if (p->info.matrix) want = dar_dtype_get(DAR_BF16, &narrow, 0);
+                CHECK(want == got, "%s %zu: %.9g, expected %.9g", p->name, n, got, want);
+            }
+        }
+    }
+    dar_model_close(x);
+    dar_model_close(y);
+}
+
+static void sampled(const char *model, const char *out)
+{
+    int status = RUN_PROGRAM(sampler, "clips/a", "--model", model, "-o", out, "--steps", "1", "--no-mp4");
+    CHECK(status == 0, "%s: %s", model, ran.err);
+}
+
+/* A model that is given away is the checkpoint with its matrices in bf16, wherever it lies; with it goes what it was
+ * trained on, which renders from rays alone, and is trained on again. */
+static void exported(void **state)
+{
+    (void)state;
+    GOOD("lora.json", SET("output_dir=give"), SET("max_train_steps=5"));
+    GOOD("give/checkpoint-5", "--export", "given");
+    same_rounded("give/checkpoint-5", "given");
+    same_rounded("backbone/checkpoint-20", "given/backbone");
+    assert_int_equal(rename("given", "moved"), 0);
+    sampled("moved", "of-moved");
+    sampled("moved/backbone", "of-rays");
+    sampled("backbone/checkpoint-20", "of-backbone"); /* in bf16, where both are used as they are written */
+    same_picture("of-rays/frames/00008.png", "of-backbone/frames/00008.png");
+    GOOD("lora.json", SET("model=moved/backbone"), SET("output_dir=again"), SET("max_train_steps=1"));
+    GOOD("lora.json", SET("model=moved"), SET("output_dir=further"), SET("max_train_steps=1"));
+
+    GOOD("backbone/checkpoint-20", "--export", "moved");
+    same_rounded("backbone/checkpoint-20", "moved");
+    CHECK(!run_is_there("moved/lora.safetensors"), "what was replaced is there");
+    BAD(2, "clips", "give/checkpoint-5", "--export", "clips");
+    CHECK(run_is_there("clips/a/meta.json"), "what is no model was replaced");
+    BAD(2, "no-model", "no-model", "--export", "bad");
+    BAD(2, "--export", "give/checkpoint-5", "--export", "bad", "--dry-run");
+    CHECK(!run_is_there("bad"), "what was refused left a directory");
+}
+
 /* The embedding of the empty prompt counts where a clip has no text. */
 static void empty_prompt(void **state)
 {
@@ -253,9 +321,10 @@ static void refusals(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),    cmocka_unit_test(stopped_and_resumed),
-        cmocka_unit_test(interrupted), cmocka_unit_test(precisions),   cmocka_unit_test(an_autoencoder),
-        cmocka_unit_test(merged),      cmocka_unit_test(empty_prompt), cmocka_unit_test(refusals),
+        cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),  cmocka_unit_test(stopped_and_resumed),
+        cmocka_unit_test(interrupted), cmocka_unit_test(precisions), cmocka_unit_test(an_autoencoder),
+        cmocka_unit_test(merged),      cmocka_unit_test(exported),   cmocka_unit_test(empty_prompt),
+        cmocka_unit_test(refusals),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-train") || !run_find(bundler, argv[0], "dar-bundle") ||

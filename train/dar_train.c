@@ -3,13 +3,13 @@
 
 #include "lib/log.h"
 #include "lib/program.h"
-#include "train/merge.h"
+#include "train/export.h"
 #include "train/trainer.h"
 #include "train/vae_trainer.h"
 
 static struct {
     dar_arg_list set;
-    const char *resume;
+    const char *resume, *export;
     double budget;
     dar_common common;
 } o;
@@ -20,6 +20,9 @@ static const dar_option options[] = {
       .help = "a key of the configuration (train/config.h): --set condition.channels=depth" },
     { .name = "resume", .placeholder = "auto|DIR", .type = DAR_ARG_TEXT, .target = &o.resume,
       .help = "go on from the run's newest checkpoint that is whole, or from that one" },
+    { .name = "export", .placeholder = "DIR", .type = DAR_ARG_TEXT, .target = &o.export,
+      .help = "train nothing: write a checkpoint, named instead of a configuration, as a model of its own, matrices in "
+      "bf16: additions and adapter, and in DIR/backbone what they were trained on; a model in DIR is replaced" },
     { .name = "mem-budget", .placeholder = "GB", .type = DAR_ARG_NUMBER, .target = &o.budget, .standard = "0",
       .lo = 0, .hi = 1e9, .help = "memory to use: the fastest way of training that fits is taken (default: all)" },
 };
@@ -104,7 +107,7 @@ static dar_status merge(const dar_train_config *c, dar_err *e)
     if (!c->save_merged || c->what != DAR_TRAIN_LORA) return DAR_OK;
     snprintf(checkpoint, sizeof checkpoint, "%s/checkpoint-%lld", c->output, (long long)c->steps);
     snprintf(out, sizeof out, "%.4000s/merged", c->output);
-    DAR_TRY(dar_merge(checkpoint, out, (dar_dtype)c->storage, e));
+    DAR_TRY(dar_export_merged(checkpoint, out, (dar_dtype)c->storage, e));
     dar_log(DAR_LOG_INFO, "%s: additions and adapter merged into the weights", out);
     return DAR_OK;
 }
@@ -133,10 +136,24 @@ static dar_status train_vae(dar_run *r, const dar_train_config *c, const dar_tra
     return s;
 }
 
+/* Instead of training. */
+static dar_status export(dar_run *r, dar_err *e)
+{
+    size_t bytes;
+    if (o.common.dry_run || o.resume || o.set.n)
+        return dar_fail(e, DAR_ERR_USAGE, "--export: expected a checkpoint and no --dry-run, --resume, --set");
+    DAR_TRY(dar_export(r->program->rest[0], o.export, DAR_BF16, &bytes, e));
+    dar_run_say(r, "%s: %.1f MB of weights", o.export, (double)bytes / 1e6);
+    dar_json_write_text(&r->json, "model", o.export);
+    dar_json_write_int(&r->json, "bytes", (int64_t)bytes);
+    return DAR_OK;
+}
+
 static dar_status train(dar_run *r, dar_err *e)
 {
     const dar_trainer_options how = { .resume = o.resume, .plan = o.common.dry_run };
     dar_train_config c;
+    if (o.export) return export(r, e);
     DAR_TRY(open_config(&c, r, e));
     dar_status s = c.what == DAR_TRAIN_VAE ? train_vae(r, &c, &how, e) : train_transformer(r, &c, &how, e);
     if (s == DAR_OK && !how.plan) {
@@ -157,7 +174,7 @@ int main(int argc, char **argv)
         .common = &o.common,
         .run = train,
         .rest_name = "CONFIG.json",
-        .rest_help = "what to train, on what, how (train/configs)",
+        .rest_help = "what to train, on what, how (train/configs); with --export, a checkpoint",
         .rest_least = 1,
         .rest_most = 1,
     };
