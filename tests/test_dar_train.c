@@ -197,7 +197,8 @@ static void an_autoencoder(void **state)
     for (int k = 0; k < 5; k++) CHECK(std[k] > 0 && std[k] != 1, "deviation of channel %d: %g", k, std[k]);
     GOOD("backbone.json", SET("model=vae/checkpoint-40"), SET("output_dir=upon"), SET("max_train_steps=2"));
     GOOD("vae.json", SET("from_scratch=false"), SET("parts.vae=vae/checkpoint-40/vae.safetensors"),
-         SET("output_dir=vae-more"), SET("max_train_steps=1"));
+         SET("output_dir=vae-more"), SET("max_train_steps=1"), SET("validation.steps=0"));
+    CHECK(!strstr(ran.err, " dB over"), "validated: %s", ran.err);
     BAD(2, "parts.vae", "vae.json", SET("from_scratch=false"), SET("output_dir=bad"));
     BAD(2, "vae.frames", "vae.json", SET("vae.width=18"), SET("output_dir=bad"));
     CHECK(!run_is_there("bad"), "what was refused left a directory");

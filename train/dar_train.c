@@ -4,8 +4,7 @@
 #include "lib/log.h"
 #include "lib/program.h"
 #include "train/export.h"
-#include "train/trainer.h"
-#include "train/vae_trainer.h"
+#include "train/learner.h"
 
 static struct {
     dar_arg_list set;
@@ -52,7 +51,7 @@ static double gigabytes(size_t bytes)
     return (double)bytes / 1e9;
 }
 
-static void say_plan(dar_run *r, const dar_train_config *c, const dar_trainer_plan *p)
+static void say_plan(dar_run *r, const dar_train_config *c, const dar_loop_plan *p)
 {
     char time[2][32];
     const dar_step_plan *s = &p->step[p->how];
@@ -61,10 +60,10 @@ static void say_plan(dar_run *r, const dar_train_config *c, const dar_trainer_pl
     dar_run_say(r,
                 "memory       %.3f GB: weights and gradients %.3f, moments %.3f, a step %.3f, batches %.3f, validation "
                 "%.3f, the program %.3f",
-                gigabytes(dar_trainer_bytes(p)), gigabytes(p->weights), gigabytes(p->moments),
+                gigabytes(dar_loop_bytes(p)), gigabytes(p->weights), gigabytes(p->moments),
                 gigabytes(s->bytes[0] + s->bytes[1]), gigabytes(p->batches), gigabytes(p->validation),
                 gigabytes(p->program));
-    if (dar_trainer_bytes(p) > p->budget)
+    if (dar_loop_bytes(p) > p->budget)
         dar_run_say(r, "             more than the %.3f GB that it may take: it would not start", gigabytes(p->budget));
     for (int k = DAR_RECOMPUTE_NONE; k <= DAR_RECOMPUTE_ALL; k++)
         dar_run_say(r, "  recompute %-9s  a step %.3f GB, %.3f TFLOP%s", dar_recompute_name[k],
@@ -77,7 +76,7 @@ static void say_plan(dar_run *r, const dar_train_config *c, const dar_trainer_pl
                 dar_log_duration(seconds * (double)c->steps, time[1], sizeof time[1]));
 }
 
-static void print_plan(dar_json_writer *w, const dar_train_config *c, const dar_trainer_plan *p)
+static void print_plan(dar_json_writer *w, const dar_train_config *c, const dar_loop_plan *p)
 {
     const dar_step_plan *s = &p->step[p->how];
     dar_json_write_object(w, "plan");
@@ -89,7 +88,7 @@ static void print_plan(dar_json_writer *w, const dar_train_config *c, const dar_
     dar_json_write_int(w, "batch_bytes", (int64_t)p->batches);
     dar_json_write_int(w, "validation_bytes", (int64_t)p->validation);
     dar_json_write_int(w, "program_bytes", (int64_t)p->program);
-    dar_json_write_int(w, "bytes", (int64_t)dar_trainer_bytes(p));
+    dar_json_write_int(w, "bytes", (int64_t)dar_loop_bytes(p));
     dar_json_write_int(w, "budget", (int64_t)p->budget);
     dar_json_write_text(w, "recompute", dar_recompute_name[p->how]);
     dar_json_write_number(w, "tokens", p->tokens);
@@ -112,30 +111,6 @@ static dar_status merge(const dar_train_config *c, dar_err *e)
     return DAR_OK;
 }
 
-static dar_status train_transformer(dar_run *r, const dar_train_config *c, const dar_trainer_options *how, dar_err *e)
-{
-    dar_trainer *t;
-    dar_status s = dar_trainer_open(&t, c, how, e);
-    if (s != DAR_OK) return s;
-    print_plan(&r->json, c, &t->plan);
-    if (how->plan) say_plan(r, c, &t->plan);
-    else s = dar_trainer_run(t, e);
-    dar_trainer_close(t);
-    return s == DAR_OK && !how->plan ? merge(c, e) : s;
-}
-
-static dar_status train_vae(dar_run *r, const dar_train_config *c, const dar_trainer_options *how, dar_err *e)
-{
-    dar_vae_trainer *t;
-    dar_status s = dar_vae_trainer_open(&t, c, how, e);
-    if (s != DAR_OK) return s;
-    print_plan(&r->json, c, &t->plan);
-    if (how->plan) say_plan(r, c, &t->plan);
-    else s = dar_vae_trainer_run(t, e);
-    dar_vae_trainer_close(t);
-    return s;
-}
-
 /* Instead of training. */
 static dar_status export(dar_run *r, dar_err *e)
 {
@@ -151,11 +126,20 @@ static dar_status export(dar_run *r, dar_err *e)
 
 static dar_status train(dar_run *r, dar_err *e)
 {
-    const dar_trainer_options how = { .resume = o.resume, .plan = o.common.dry_run };
+    static const dar_learner *const learners[] = {
+        [DAR_TRAIN_LORA] = &dar_learner_dit, [DAR_TRAIN_FULL] = &dar_learner_dit, [DAR_TRAIN_VAE] = &dar_learner_vae
+    };
+    const dar_loop_options how = { .resume = o.resume, .plan = o.common.dry_run };
     dar_train_config c;
+    dar_loop *l;
     if (o.export) return export(r, e);
     DAR_TRY(open_config(&c, r, e));
-    dar_status s = c.what == DAR_TRAIN_VAE ? train_vae(r, &c, &how, e) : train_transformer(r, &c, &how, e);
+    dar_status s = dar_loop_open(&l, learners[c.what], &c, &how, e);
+    if (s == DAR_OK) print_plan(&r->json, &c, &l->plan);
+    if (s == DAR_OK && how.plan) say_plan(r, &c, &l->plan);
+    if (s == DAR_OK && !how.plan) s = dar_loop_run(l, e);
+    dar_loop_close(l);
+    if (s == DAR_OK && !how.plan) s = merge(&c, e);
     if (s == DAR_OK && !how.plan) {
         dar_run_say(r, "%s: %lld steps done", c.output, (long long)c.steps);
         dar_json_write_text(&r->json, "run", c.output);
