@@ -1,8 +1,8 @@
 /* deflate.h: streams in zlib's format, deflated by all threads.
  *
  * A stream is cut into pieces of a fixed size that know nothing of each other, so the bytes do not depend on the number
- * of threads, and any reader of zlib streams, HDF5's filter among them, reads the whole.  Pieces of zeros, of which
- * pictures of a scene are full, are deflated once and copied.  Source: RFC 1950, RFC 1951. */
+ * of threads, and any reader of zlib streams, HDF5's filter among them, reads the whole.  Source: RFC 1950, RFC 1951.
+ */
 #ifndef DAR_DATA_DEFLATE_H
 #define DAR_DATA_DEFLATE_H
 
