@@ -11,21 +11,26 @@ dar_groups dar_groups_of(size_t clips, size_t tokens, size_t rows, size_t split,
 {
     size_t chunk = CHUNK_ELEMENTS / (width ? width : 1);
     DAR_ASSERT(rows && (split || rows == 1), "groups: %zu rows, split %zu", rows, split);
-    return (dar_groups){ clips, tokens, rows, split, chunk > CHUNK_TOKENS ? chunk : CHUNK_TOKENS };
+    return (dar_groups){ clips, tokens, rows, split, chunk > CHUNK_TOKENS ? chunk : CHUNK_TOKENS, 0 };
 }
 
 size_t dar_group_of(const dar_groups *g, size_t token)
 {
-    size_t clip = token / g->tokens, r = g->rows == 1 ? 0 : token % g->tokens / g->split;
+    size_t clip = token / g->tokens, r = g->rows == 1 ? 0 : (g->first + token % g->tokens) / g->split;
     return clip * g->rows + (r < g->rows ? r : g->rows - 1);
+}
+
+static size_t within(size_t i, size_t least, size_t most)
+{
+    return i < least ? least : i > most ? most : i;
 }
 
 /* Tokens [begin, end) of a clip that take row r. */
 static void span(const dar_groups *g, size_t r, size_t *begin, size_t *end)
 {
-    size_t b = r * g->split, e = r + 1 < g->rows ? b + g->split : g->tokens;
-    *begin = b < g->tokens ? b : g->tokens;
-    *end = e < g->tokens ? e : g->tokens;
+    size_t all = g->first + g->tokens, b = r * g->split, e = r + 1 < g->rows ? b + g->split : all;
+    *begin = within(b, g->first, all) - g->first;
+    *end = within(e, g->first, all) - g->first;
 }
 
 static size_t span_chunks(const dar_groups *g, size_t r)

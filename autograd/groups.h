@@ -2,6 +2,7 @@
  *
  * Tokens [B, N] take parameter rows [B, R]: token i of a clip takes row min(i / split, R - 1).  R = 1: one row for all;
  * R = 2: the first `split` tokens (the first frame) have their own; R = T with split tokens per frame: one per frame.
+ * Where the tokens are a piece of a clip, i counts from `first`.
  *
  * The gradient of a parameter row is a sum over its tokens.  They are cut in chunks that never straddle a group; each
  * chunk makes a partial sum, and the partial sums of a group are added by a fixed tree. */
@@ -13,9 +14,10 @@
 typedef struct dar_groups {
     size_t clips, tokens, rows, split; /* B, N, R */
     size_t chunk;                      /* tokens per chunk */
+    size_t first;                      /* place of token 0 in its clip */
 } dar_groups;
 
-/* Groups of tokens that are rows of `width` elements; split > 0 unless rows is 1. */
+/* Groups of tokens that are rows of `width` elements; split > 0 unless rows is 1; first is 0. */
 dar_groups dar_groups_of(size_t clips, size_t tokens, size_t rows, size_t split, size_t width);
 
 /* The group, row b R + r of the parameter, of token b N + i. */

@@ -42,6 +42,7 @@ typedef struct dar_norm_opt {
     bool cast;  /* y has storage type `out`, not that of x */
     dar_dtype out;
     int64_t split; /* modulate: tokens per parameter row */
+    int64_t first; /* modulate: place in its clip of token 0 */
 } dar_norm_opt;
 
 /* Normalise the rows of the last dimension.
@@ -60,7 +61,7 @@ dar_val *dar_layer_norm(dar_tape *t, dar_val *x, dar_val *w, dar_val *b, const d
 /* Layer norm with a scale and a shift that depend on the token's place: y = layer_norm(x) (1 + scale) + shift.
  *
  *   x              [B, N, D]
- *   scale, shift   [B, R, D]   token i takes row min(i / split, R - 1); R = 1: split is not used
+ *   scale, shift   [B, R, D]   token i takes row min((first + i) / split, R - 1); R = 1: split is not used
  *
  * R = 2 is a clip whose first frame (split tokens) has a time of its own.  Source: Peebles and Xie 2022, section 3.2.
  */
@@ -71,9 +72,9 @@ dar_val *dar_modulate(dar_tape *t, dar_val *x, dar_val *scale, dar_val *shift, c
  *   x, u   [B, N, D]
  *   g      [B, R, D]   rows as for dar_modulate */
 typedef struct dar_gate_attr {
-    int64_t split;
+    int64_t split, first;
 } dar_gate_attr;
-dar_val *dar_gate(dar_tape *t, dar_val *x, dar_val *u, dar_val *g, int64_t split);
+dar_val *dar_gate(dar_tape *t, dar_val *x, dar_val *u, dar_val *g, dar_gate_attr a);
 
 /* Norm over channels: y = x / max(||x||, 1e-12) sqrt(C) w at every place, ||x|| over the channels there.
  *

@@ -34,8 +34,9 @@ struct dar_node {
     const void *attr;
     dar_tensor aux;
     dar_segment_fn *fn;
+    dar_rows_attr rows; /* of a segment in pieces: fn is NULL */
     void *arg;
-    struct dar_keeping *kept;
+    struct dar_keeping *kept; /* [pieces]; NULL: nothing */
 };
 
 /* ---------------------------------------------------------------- life */
@@ -377,42 +378,71 @@ static void leave(dar_tape *t, const struct place *p)
     dar_arena_reset(&t->meta, p->meta);
 }
 
-/* Stand-ins for the segment's inputs, sharing value and gradient; the same value stays one value. */
-static void stand_in(dar_tape *t, const dar_node *node, dar_val **in)
+static int64_t pieces_of(const dar_node *node)
+{
+    return node->fn ? 1 : dar_rows_count(&node->rows.shape, node->rows.most);
+}
+
+static bool is_cut(const dar_node *node, int i)
+{
+    return !node->fn && node->rows.cut & DAR_KEEP_X(i);
+}
+
+/* Stand-ins for the segment's inputs, or for a piece of them, sharing value and gradient; the same value stays one
+ * value.  had: those that have a gradient from others. */
+static void stand_in(dar_tape *t, const dar_node *node, const bool *had, const dar_rows *rows, dar_val **in)
 {
     for (int i = 0; i < node->n; i++) {
         for (int j = 0; j < i; j++)
-            if (node->in[j] == node->in[i]) in[i] = in[j];
+            if (node->in[j] == node->in[i] && is_cut(node, j) == is_cut(node, i)) in[i] = in[j];
         if (!node->in[i] || in[i]) continue;
         in[i] = dar_tape_room(t, sizeof *in[i]);
         *in[i] = *node->in[i];
         in[i]->leaf = true; /* its gradient is not the segment's to free */
+        if (!is_cut(node, i)) continue;
+        in[i]->x = dar_rows_view(&in[i]->x, *rows);
+        if (in[i]->g.data) in[i]->g = dar_rows_view(&in[i]->g, *rows);
+        in[i]->has_grad = had[i];
     }
+}
+
+static dar_val *run_piece(dar_tape *t, const dar_node *node, dar_val *const *in, const dar_rows *rows)
+{
+    return node->fn ? node->fn(t, node->arg, in) : node->rows.fn(t, node->arg, in, *rows);
+}
+
+static void piece_backward(dar_tape *t, const dar_node *node, const bool *had, int64_t i)
+{
+    dar_rows rows = node->fn ? (dar_rows){ 0 } : dar_rows_of(&node->rows.shape, node->rows.most, i);
+    dar_val *in[DAR_OP_IN] = { 0 };
+    struct place p = enter(t);
+
+    t->spare = NULL;
+    t->last = NULL;
+    t->oldest = t->meta.base + t->meta.used;
+    t->kept = t->keep && node->kept ? &node->kept[i] : NULL;
+    if (t->kept) t->kept->at = 0;
+    t->replaying = true;
+    stand_in(t, node, had, &rows, in);
+    dar_val *y = run_piece(t, node, in, &rows);
+    if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
+    y->g = node->fn ? node->y->g : dar_rows_view(&node->y->g, rows);
+    y->has_grad = true;
+    sweep(t);
+    for (int k = 0; k < node->n; k++)
+        if (in[k]) node->in[k]->has_grad = in[k]->has_grad;
+    leave(t, &p);
 }
 
 static void segment_backward(dar_tape *t, const dar_node *node)
 {
-    dar_val *in[DAR_OP_IN] = { 0 };
+    bool had[DAR_OP_IN] = { false };
 
-    for (int i = 0; i < node->n; i++)
+    for (int i = 0; i < node->n; i++) {
         if (node->in[i] && node->in[i]->wants_grad) ensure_grad(t, node->in[i]); /* before the mark: it stays */
-
-    struct place p = enter(t);
-    t->spare = NULL;
-    t->last = NULL;
-    t->oldest = t->meta.base + t->meta.used;
-    t->kept = t->keep ? node->kept : NULL;
-    node->kept->at = 0;
-    t->replaying = true;
-    stand_in(t, node, in);
-    dar_val *y = node->fn(t, node->arg, in);
-    if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
-    y->g = node->y->g;
-    y->has_grad = true;
-    sweep(t);
-    for (int i = 0; i < node->n; i++)
-        if (in[i]) node->in[i]->has_grad = in[i]->has_grad;
-    leave(t, &p);
+        had[i] = node->in[i] && node->in[i]->has_grad;
+    }
+    for (int64_t i = 0; i < pieces_of(node); i++) piece_backward(t, node, had, i);
 }
 
 static void sweep(dar_tape *t)
@@ -445,32 +475,94 @@ void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed)
 
 /* ---------------------------------------------------------------- segments */
 
+int64_t dar_rows_count(const dar_shape *y, int64_t most)
+{
+    return y->d[0] * y->d[1] <= most ? 1 : y->d[0] * ((y->d[1] + most - 1) / most);
+}
+
+dar_rows dar_rows_of(const dar_shape *y, int64_t most, int64_t i)
+{
+    int64_t B = y->d[0], N = y->d[1], n = (N + most - 1) / most, k = i % n;
+    if (B * N <= most) return (dar_rows){ 0, B, 0, N };
+    return (dar_rows){ i / n, 1, N * k / n, N * (k + 1) / n - N * k / n };
+}
+
+dar_tensor dar_rows_view(const dar_tensor *x, dar_rows r)
+{
+    dar_tensor clips = dar_tensor_narrow(x, 0, r.clip, r.clips);
+    return dar_tensor_narrow(&clips, 1, r.first, r.count);
+}
+
+/* Run piece i into its part of y. */
+static void piece_forward(dar_tape *t, const dar_node *node, int64_t i)
+{
+    dar_rows rows = node->fn ? (dar_rows){ 0 } : dar_rows_of(&node->rows.shape, node->rows.most, i);
+    dar_tensor y = node->fn ? node->y->x : dar_rows_view(&node->y->x, rows);
+    dar_val *in[DAR_OP_IN] = { 0 };
+    struct place p = enter(t);
+    char a[96], b[96];
+
+    t->recording = t->touched = t->replaying = false;
+    t->kept = p.was.recording && node->kept ? &node->kept[i] : NULL;
+    for (int k = 0; k < node->n; k++) {
+        in[k] = node->in[k];
+        if (!in[k] || !is_cut(node, k)) continue;
+        in[k] = push_val(t, dar_rows_view(&in[k]->x, rows));
+        in[k]->wants_grad = node->in[k]->wants_grad;
+        in[k]->leaf = true;
+    }
+    dar_val *r = run_piece(t, node, in, &rows);
+    DAR_ASSERT(r->x.dtype == y.dtype && dar_shape_equal(&r->x.shape, &y.shape),
+               "segment: result %s %s, announced %s %s", dar_dtype_name(r->x.dtype),
+               dar_shape_text(&r->x.shape, a, sizeof a), dar_dtype_name(y.dtype),
+               dar_shape_text(&y.shape, b, sizeof b));
+    if (!t->arena->plan) dar_tensor_copy(&y, &r->x);
+    t->touched |= r->wants_grad; /* an input or a leaf, handed through */
+    node->y->wants_grad |= p.was.recording && t->touched;
+    if (t->kept && t->touched) p.keep = dar_arena_mark(t->keep); /* the replay needs what was kept */
+    leave(t, &p);
+}
+
+/* like: a node that says what is to run, and its result's type and shape */
+static dar_val *segment(dar_tape *t, const dar_node *like, dar_val *const *in, bool unread)
+{
+    const dar_rows_attr *a = &like->rows;
+    dar_node *node = dar_tape_room(t, sizeof *node);
+    DAR_ASSERT(like->n >= 0 && like->n <= DAR_OP_IN, "segment: %d inputs, at most %d", like->n, DAR_OP_IN);
+    *node = *like;
+    node->prev = t->last;
+    for (int i = 0; i < node->n; i++) {
+        check_origin(t, in[i]);
+        node->in[i] = in[i];
+    }
+    unread &= t->replaying;
+    node->y =
+        push_val(t, unread ? dar_tensor_of(a->type, a->shape, NULL) : dar_tensor_push(t->arena, a->type, a->shape));
+    if (unread) {
+        node->y->wants_grad = true;
+    } else {
+        int64_t pieces = pieces_of(node);
+        if (t->keep) node->kept = dar_tape_room(t, (size_t)pieces * sizeof *node->kept);
+        for (int64_t i = 0; i < pieces; i++) piece_forward(t, node, i);
+    }
+    if (node->y->wants_grad) t->last = node;
+    return node->y;
+}
+
 dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const *in, int n, dar_dtype type,
                      dar_shape shape)
 {
-    char a[96], b[96];
-    DAR_ASSERT(n >= 0 && n <= DAR_OP_IN, "segment: %d inputs, at most %d", n, DAR_OP_IN);
-    for (int i = 0; i < n; i++) check_origin(t, in[i]);
-    dar_val *y = push_val(t, dar_tensor_push(t->arena, type, shape));
-    dar_node *node = dar_tape_room(t, sizeof *node);
-    *node = (dar_node){ .prev = t->last, .n = n, .y = y, .fn = fn, .arg = arg };
-    node->kept = dar_tape_room(t, sizeof *node->kept);
-    for (int i = 0; i < n; i++) node->in[i] = in[i];
+    return segment(t, &(dar_node){ .n = n, .fn = fn, .arg = arg, .rows = { .type = type, .shape = shape } }, in, false);
+}
 
-    struct place p = enter(t);
-    t->recording = t->touched = t->replaying = false;
-    t->kept = p.was.recording && t->keep ? node->kept : NULL;
-    dar_val *r = fn(t, arg, in);
-    DAR_ASSERT(r->x.dtype == type && dar_shape_equal(&r->x.shape, &shape), "segment: result %s %s, announced %s %s",
-               dar_dtype_name(r->x.dtype), dar_shape_text(&r->x.shape, a, sizeof a), dar_dtype_name(type),
-               dar_shape_text(&shape, b, sizeof b));
-    if (!t->arena->plan) dar_tensor_copy(&y->x, &r->x);
-    t->touched |= r->wants_grad; /* an input or a leaf, handed through */
-    y->wants_grad = p.was.recording && t->touched;
-    if (y->wants_grad && t->keep) p.keep = dar_arena_mark(t->keep); /* the replay needs what was kept */
-    leave(t, &p);
-    if (y->wants_grad) t->last = node;
-    return y;
+dar_val *dar_segment_rows(dar_tape *t, const dar_rows_attr *a, dar_val *const *in, int n)
+{
+    DAR_ASSERT(a->shape.n >= 2 && a->most > 0, "segment: no rows to cut");
+    for (int i = 0; i < n; i++)
+        DAR_ASSERT(!(a->cut & DAR_KEEP_X(i)) || (in[i]->x.shape.n >= 2 && in[i]->x.shape.d[0] == a->shape.d[0] &&
+                                                 in[i]->x.shape.d[1] == a->shape.d[1]),
+                   "segment: input %d has not the result's rows", i);
+    return segment(t, &(dar_node){ .n = n, .arg = a->arg, .rows = *a }, in, a->unread);
 }
 
 dar_val *dar_apply_kept(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr, dar_keep keep)

@@ -99,6 +99,32 @@ typedef dar_val *dar_segment_fn(dar_tape *t, void *arg, dar_val *const *in);
 dar_val *dar_segment(dar_tape *t, dar_segment_fn *fn, void *arg, dar_val *const *in, int n, dar_dtype type,
                      dar_shape shape);
 
+/* Of [B, N, ..]: of `clips` clips, from `clip` on, rows [first, first + count). */
+typedef struct dar_rows {
+    int64_t clip, clips, first, count;
+} dar_rows;
+
+/* A segment cut along N: y [B, N, ..] = fn(inputs), where a row of y depends on its own row of the inputs that are cut.
+ * fn is given one piece of them after the other and makes y's, so that forward and backward hold what is made of one
+ * piece.  Inputs that are not cut, and leaves, get the sum of the pieces' gradients, in order; how they are cut depends
+ * on B, N and `most` alone. */
+typedef dar_val *dar_rows_fn(dar_tape *t, void *arg, dar_val *const *in, dar_rows rows);
+typedef struct dar_rows_attr {
+    dar_rows_fn *fn;
+    void *arg;
+    unsigned cut; /* DAR_KEEP_X bits of inputs [B, N, ..] */
+    int64_t most; /* rows in a piece */
+    bool unread;  /* nobody reads y's value in the replay of a segment around this one: there it is not computed */
+    dar_dtype type;
+    dar_shape shape; /* of y */
+} dar_rows_attr;
+dar_val *dar_segment_rows(dar_tape *t, const dar_rows_attr *a, dar_val *const *in, int n);
+
+/* How many pieces those are, and piece i: all of [B, N, ..] if it fits, else of one clip each, all about as long. */
+int64_t dar_rows_count(const dar_shape *y, int64_t most);
+dar_rows dar_rows_of(const dar_shape *y, int64_t most, int64_t i);
+dar_tensor dar_rows_view(const dar_tensor *x, dar_rows r);
+
 /* What a call inside a segment leaves in the keep arena, so that the replay need not run it again.  Worth it where
  * recomputation is dear and results are small: products, attention. */
 typedef enum dar_keep {

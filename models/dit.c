@@ -8,7 +8,8 @@
 
 #include "models/patch.h"
 
-#define SLOWEST 10000 /* the frequencies of the time encoding fall from 1 to 1 / SLOWEST */
+#define SLOWEST 10000     /* the frequencies of the time encoding fall from 1 to 1 / SLOWEST */
+#define PIECE   (8 << 20) /* its gradient is then 32 MB, and the weights are read often enough to be read once */
 
 /* ---------------------------------------------------------------- parameters */
 
@@ -87,7 +88,7 @@ static void declare_ends(dar_dit *m, dar_params *p)
 
 void dar_dit_init(dar_dit *m, dar_params *p, const dar_dit_config *c, const dar_adapter_config *a)
 {
-    *m = (dar_dit){ .c = *c, .storage = p->storage, .main = p->main };
+    *m = (dar_dit){ .c = *c, .storage = p->storage, .main = p->main, .piece = PIECE };
     m->block = calloc((size_t)c->layers, sizeof *m->block);
     DAR_ASSERT(m->block, "dit: no memory for %lld blocks", (long long)c->layers);
     declare_ends(m, p);

@@ -68,6 +68,7 @@ typedef struct dar_dit {
 
     bool quantise; /* products whose weights are stored in 8 bits round their operands too: faster, less exact */
     dar_dit_replay replay;
+    int64_t piece; /* numbers [tokens, feed-forward width] of that layer that are held at a time */
 } dar_dit;
 
 /* Declare all parameters, under the names of the public checkpoint.  m->block is on the heap. */

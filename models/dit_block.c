@@ -21,8 +21,8 @@ struct block {
     dar_val *log_weight; /* a leaf */
     dar_val *e0, *k, *v; /* inputs of a segment: in a replay, what stands for them */
     bool rest;           /* of the first frame nothing is wanted but that the others see it */
-    int from, to;        /* parts */
     bool cheap;          /* a segment that keeps its products */
+    int64_t first;       /* place of the first token, where they are a piece of a clip */
 };
 
 /* Rows [B, R, ..] of modulations, as the frames after the first take them. */
@@ -82,7 +82,14 @@ static dar_val *rms(dar_tape *t, const struct block *a, const dar_param *w, dar_
 /* The norms before products: from the stream to the products' type. */
 static dar_norm_opt norm_before(const struct block *a)
 {
-    return (dar_norm_opt){ .eps = a->m->c.eps, .cast = true, .out = a->m->storage, .split = a->s->frame };
+    return (dar_norm_opt){
+        .eps = a->m->c.eps, .cast = true, .out = a->m->storage, .split = a->s->frame, .first = a->first
+    };
+}
+
+static dar_val *gate(dar_tape *t, const struct block *a, dar_val *x, dar_val *u, dar_val *g)
+{
+    return dar_gate(t, x, u, g, (dar_gate_attr){ a->s->frame, a->first });
 }
 
 /* x [B, L, D] -> [B, L, D], all three; with a->rest self-attention gives the tokens after the first frame's alone */
@@ -102,7 +109,7 @@ static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
     }
     dar_val *q = dar_rope(t, rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h)), rope);
     h = dar_attention(t, q, k, v, &o);
-    return dar_gate(t, x, last_product(t, a, DAR_SELF_O, h, true), mod[GATE], a->s->frame);
+    return gate(t, a, x, last_product(t, a, DAR_SELF_O, h, true), mod[GATE]);
 }
 
 static dar_val *cross_attention(dar_tape *t, const struct block *a, dar_val *x)
@@ -123,51 +130,108 @@ static dar_val *feed_forward(dar_tape *t, const struct block *a, dar_val *x)
     modulations(t, a, 3, mod);
     dar_val *h = dar_modulate(t, x, mod[SCALE], mod[SHIFT], &norm);
     h = last_product(t, a, DAR_FFN_DOWN, activated(t, a, h), true);
-    return dar_gate(t, x, h, mod[GATE], a->s->frame);
+    return gate(t, a, x, h, mod[GATE]);
 }
 
-typedef dar_val *part_fn(dar_tape *t, const struct block *a, dar_val *x);
-static part_fn *const parts[] = { self_attention, cross_attention, feed_forward };
+/* ---------------------------------------------------------------- the feed-forward layer in pieces */
 
-/* in: x, e0, k, v */
-static dar_val *run_parts(dar_tape *t, void *arg, dar_val *const *in)
+static int64_t rows_at_a_time(const dar_dit *m)
+{
+    return m->piece > m->c.ffn ? m->piece / m->c.ffn : 1;
+}
+
+/* What a piece of the tokens sees. */
+static struct block piece_of(dar_tape *t, const struct block *a, dar_rows r)
+{
+    struct block p = *a;
+    if (r.clips < a->e0->x.shape.d[0]) p.e0 = dar_slice(t, a->e0, 0, r.clip, r.clips);
+    p.first = r.first;
+    return p;
+}
+
+/* in: x, e0 */
+static dar_val *feed_forward_rows(dar_tape *t, void *arg, dar_val *const *in, dar_rows r)
 {
     struct block a = *(const struct block *)arg;
-    dar_val *x = in[0];
-    a.e0 = in[1], a.k = in[2], a.v = in[3];
-    for (int i = a.from; i < a.to; i++) x = parts[i](t, &a, x);
-    return x;
+    a.e0 = in[1];
+    a = piece_of(t, &a, r);
+    return feed_forward(t, &a, in[0]);
+}
+
+static dar_val *feed_forward_pieces(dar_tape *t, const struct block *a, dar_val *x, bool unread)
+{
+    dar_rows_attr rows = { .fn = feed_forward_rows,
+                           .arg = dar_tape_store(t, a, sizeof *a),
+                           .cut = DAR_KEEP_X(0),
+                           .most = rows_at_a_time(a->m),
+                           .unread = unread,
+                           .type = x->x.dtype,
+                           .shape = x->x.shape };
+    return dar_segment_rows(t, &rows, (dar_val *[]){ x, a->e0 }, 2);
 }
 
 /* ---------------------------------------------------------------- the stack */
 
 static struct block block_of(const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x, dar_val *e0)
 {
-    return (struct block){ m, &m->block[i], s, x->log_weight, e0, x->k[i], x->v[i], false, 0, DAR_COUNT(parts), false };
+    return (struct block){
+        .m = m, .b = &m->block[i], .s = s, .log_weight = x->log_weight, .e0 = e0, .k = x->k[i], .v = x->v[i]
+    };
 }
 
 dar_val *dar_dit_block_forward(dar_tape *t, const dar_dit *m, int i, const dar_dit_scene *s, const dar_dit_text *x,
                                dar_val *e0, dar_val *tokens)
 {
     struct block a = block_of(m, i, s, x, e0);
-    return run_parts(t, &a, (dar_val *[]){ tokens, e0, x->k[i], x->v[i] });
+    tokens = self_attention(t, &a, tokens);
+    tokens = cross_attention(t, &a, tokens);
+    return feed_forward(t, &a, tokens);
+}
+
+/* Segments: in: x, e0, k, v */
+static struct block block_in(const void *arg, dar_val *const *in)
+{
+    struct block a = *(const struct block *)arg;
+    a.e0 = in[1], a.k = in[2], a.v = in[3];
+    return a;
+}
+
+static dar_val *self_segment(dar_tape *t, void *arg, dar_val *const *in)
+{
+    struct block a = block_in(arg, in);
+    return self_attention(t, &a, in[0]);
+}
+
+static dar_val *cross_segment(dar_tape *t, void *arg, dar_val *const *in)
+{
+    struct block a = block_in(arg, in);
+    return cross_attention(t, &a, in[0]);
+}
+
+static dar_val *block_segment(dar_tape *t, void *arg, dar_val *const *in)
+{
+    struct block a = block_in(arg, in);
+    dar_val *x = cross_attention(t, &a, self_attention(t, &a, in[0]));
+    return feed_forward_pieces(t, &a, x, true);
+}
+
+static dar_val *segment(dar_tape *t, dar_segment_fn *fn, struct block *a, dar_val *x)
+{
+    dar_val *in[] = { x, a->e0, a->k, a->v };
+    return dar_segment(t, fn, a, in, DAR_COUNT(in), x->x.dtype, x->x.shape);
 }
 
 /* A block as a segment; where little is computed again, a segment for each part: only one at a time is then whole. */
 static dar_val *segments(dar_tape *t, const struct block *b, dar_val *tokens)
 {
-    bool cheap = b->m->replay == DAR_REPLAY_CHEAP && t->keep;
-    int step = cheap ? 1 : DAR_COUNT(parts);
-    for (int i = 0; i < (int)DAR_COUNT(parts); i += step) {
-        struct block *a = dar_tape_store(t, b, sizeof *b);
-        dar_val *in[] = { tokens, a->e0, a->k, a->v };
-        a->from = i;
-        a->to = i + step;
-        a->cheap = cheap;
-        tokens = dar_segment(t, run_parts, a, in, DAR_COUNT(in), tokens->x.dtype, tokens->x.shape);
-    }
-    return tokens;
+    struct block *a = dar_tape_store(t, b, sizeof *b);
+    a->cheap = b->m->replay == DAR_REPLAY_CHEAP && t->keep;
+    if (!a->cheap) return segment(t, block_segment, a, tokens);
+    tokens = segment(t, cross_segment, a, segment(t, self_segment, a, tokens));
+    return feed_forward_pieces(t, a, tokens, false);
 }
+
+typedef dar_val *part_fn(dar_tape *t, const struct block *a, dar_val *x);
 
 static void in_place(dar_tape *t, part_fn *part, const struct block *a, dar_val *from, dar_val *to)
 {
@@ -177,15 +241,23 @@ static void in_place(dar_tape *t, part_fn *part, const struct block *a, dar_val 
     dar_arena_reset(t->arena, m);
 }
 
-/* Nothing looks back: one stream, written over after every part. */
-static dar_val *parts_in_place(dar_tape *t, struct block a, size_t first, dar_val *tokens)
+/* Nothing looks back: one stream, written over after every part.  begun: self-attention has been. */
+static dar_val *parts_in_place(dar_tape *t, struct block a, bool begun, dar_val *tokens)
 {
-    for (size_t i = first; i < DAR_COUNT(parts); i++) {
+    if (!begun) {
         dar_val *to = a.rest ? others(t, &a, 1, tokens) : tokens;
-        in_place(t, parts[i], &a, tokens, to);
+        in_place(t, self_attention, &a, tokens, to);
         if (a.rest) a.e0 = later(t, a.e0);
         a.rest = false;
         tokens = to;
+    }
+    in_place(t, cross_attention, &a, tokens, tokens);
+    const dar_shape *s = &tokens->x.shape;
+    for (int64_t i = 0; i < dar_rows_count(s, rows_at_a_time(a.m)); i++) {
+        dar_rows r = dar_rows_of(s, rows_at_a_time(a.m), i);
+        struct block piece = piece_of(t, &a, r);
+        dar_val *x = dar_slice(t, dar_slice(t, tokens, 0, r.clip, r.clips), 1, r.first, r.count);
+        in_place(t, feed_forward, &piece, x, x);
     }
     return tokens;
 }
@@ -195,7 +267,7 @@ void dar_dit_blocks_begin(dar_tape *t, const dar_dit *m, const dar_dit_scene *s,
 {
     struct block a = { .m = m, .b = &m->block[0], .s = s, .e0 = e->e0 };
     DAR_ASSERT(!t->recording, "dit: halves are not recorded");
-    in_place(t, parts[0], &a, tokens, tokens);
+    in_place(t, self_attention, &a, tokens, tokens);
 }
 
 dar_val *dar_dit_blocks_end(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,

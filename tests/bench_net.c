@@ -30,7 +30,8 @@ static dar_val *run(bench *b, const dar_dit *m)
     dar_dit_moment e = { .e0 = dar_leaf(t, s->e0, NULL) };
     *scene = (dar_dit_scene){ .frame = 256, .rope = dar_leaf(t, s->rope, NULL) };
     dar_dit_text_prepare(t, m, &s->text, NULL, x);
-    dar_val *tokens = dar_contiguous(t, dar_leaf(t, s->tokens, NULL)); /* they may be written over */
+    dar_val *tokens = dar_leaf(t, s->tokens, NULL);
+    if (!t->recording) tokens = dar_contiguous(t, tokens); /* it is written over */
     return dar_dit_blocks(t, m, scene, x, &e, tokens);
 }
 

@@ -155,7 +155,7 @@ static void residual(bench *b)
 static dar_val *call_gate(dar_tape *t, dar_val *const *x, const int64_t *s)
 {
     (void)s;
-    return dar_gate(t, x[0], x[1], x[2], norm_opt.split);
+    return dar_gate(t, x[0], x[1], x[2], (dar_gate_attr){ .split = norm_opt.split });
 }
 
 /* Channels, height, width. */

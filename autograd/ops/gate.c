@@ -32,6 +32,7 @@ static struct walk walk_of(const dar_opctx *c, bool backward)
     w.k = dar_kern_for(w.type);
     w.row = dar_mul_size(w.d, dar_dtype_size(w.type));
     w.groups = dar_groups_of((size_t)s->d[0], (size_t)s->d[1], (size_t)c->x[G].shape.d[1], (size_t)a->split, w.d);
+    w.groups.first = (size_t)a->first;
     w.part = w.scratch = dar_mul_size(w.groups.clips * w.groups.rows, w.row);
     if (backward && c->gx[G].data)
         w.scratch = dar_add_size(w.scratch, dar_mul_size(dar_groups_chunks(&w.groups), w.row));
@@ -144,12 +145,14 @@ static dar_shape gate_shape(const dar_shape *in, int n_in, const void *attr)
     DAR_ASSERT(in[G].n == 3 && in[G].d[0] == in[X].d[0] && in[G].d[1] >= 1 && in[G].d[2] == in[X].d[2],
                "gate: x is %s [B, N, D], g is %s, expected [B, R, D]", dar_shape_text(&in[X], a, sizeof a),
                dar_shape_text(&in[G], b, sizeof b));
-    DAR_ASSERT(o->split > 0 || in[G].d[1] == 1, "gate: %lld rows need a split", (long long)in[G].d[1]);
+    DAR_ASSERT(o->first >= 0 && (o->split > 0 || in[G].d[1] == 1),
+               "gate: %lld rows need a split, and a place from 0 on", (long long)in[G].d[1]);
     return in[X];
 }
 
 static const dar_gate_attr unsplit = { 0 }, split_3 = { .split = 3 }, split_9 = { .split = 9 },
-                           split_66 = { .split = 66 };
+                           split_66 = { .split = 66 }, later = { .split = 3, .first = 2 },
+                           later_still = { .split = 3, .first = 7 };
 
 #define GATE(B, N, R, D)                                                                                               \
     {                                                                                                                  \
@@ -169,10 +172,13 @@ static const dar_sample gate_samples[] = {
     { .in = GATE(2, 5, 2, 3), .attr = &split_9 },     /* a row that nobody uses */
     { .in = GATE(1, 2, 1, 1030), .attr = &unsplit },  /* pieces of columns */
     { .in = GATE(1, 68, 2, 129), .attr = &split_66 }, /* several chunks in each group */
+    { .in = GATE(2, 5, 3, 7), .attr = &later },       /* a piece of a clip: its first token is the third */
+    { .in = GATE(1, 5, 2, 7), .attr = &later_still }, /* and one that begins after the first row's */
 };
 
 static const dar_error_sample gate_errors[] = {
     { .in = GATE(2, 5, 2, 3), .attr = &unsplit },
+    { .in = GATE(2, 5, 2, 3), .attr = &(const dar_gate_attr){ .split = 3, .first = -1 } },
     { .in = { { 3, { 2, 5, 3 } }, { 3, { 2, 4, 3 } }, { 3, { 2, 1, 3 } } }, .attr = &unsplit },
     { .in = { { 3, { 2, 5, 3 } }, { 3, { 2, 5, 3 } }, { 3, { 1, 1, 3 } } }, .attr = &unsplit },
 };
@@ -194,7 +200,7 @@ const dar_op dar_op_gate = {
     .n_errors = DAR_COUNT(gate_errors),
 };
 
-dar_val *dar_gate(dar_tape *t, dar_val *x, dar_val *u, dar_val *g, int64_t split)
+dar_val *dar_gate(dar_tape *t, dar_val *x, dar_val *u, dar_val *g, dar_gate_attr a)
 {
-    return dar_apply(t, &dar_op_gate, (dar_val *[]){ x, u, g }, 3, &(dar_gate_attr){ split });
+    return dar_apply(t, &dar_op_gate, (dar_val *[]){ x, u, g }, 3, &a);
 }

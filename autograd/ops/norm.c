@@ -52,9 +52,10 @@ static struct walk walk_of(const dar_opctx *c, const struct kind *kind, bool bac
 
     w.k = dar_kern_for(w.type);
     w.row = dar_mul_size(w.d, dar_dtype_size(w.type));
-    if (kind->grouped)
-        w.groups = dar_groups_of((size_t)s->d[0], (size_t)s->d[1], (size_t)gain->d[1], (size_t)o->split, w.d);
-    else w.groups = dar_groups_of(1, dar_tensor_rows(&c->x[X]), 1, 0, w.d);
+    w.groups = kind->grouped
+                   ? dar_groups_of((size_t)s->d[0], (size_t)s->d[1], (size_t)gain->d[1], (size_t)o->split, w.d)
+                   : dar_groups_of(1, dar_tensor_rows(&c->x[X]), 1, 0, w.d);
+    if (kind->grouped) w.groups.first = (size_t)o->first;
 
     size_t weights = dar_mul_size(w.groups.clips * w.groups.rows, w.row);
     w.scratch = dar_mul_size(2 * (size_t)c->threads, w.row);
@@ -354,12 +355,15 @@ static dar_shape modulated_shape(const dar_shape *in, int n_in, const void *attr
                        in[i].d[2] == in[X].d[2] && in[i].d[1] == in[GAIN].d[1],
                    "modulate: x is %s [B, N, D], input %d is %s, expected [B, R, D]",
                    dar_shape_text(&in[X], a, sizeof a), i, dar_shape_text(&in[i], b, sizeof b));
-    DAR_ASSERT(o->split > 0 || in[GAIN].d[1] == 1, "modulate: %lld rows need a split", (long long)in[GAIN].d[1]);
+    DAR_ASSERT(o->first >= 0 && (o->split > 0 || in[GAIN].d[1] == 1),
+               "modulate: %lld rows need a split, and a place from 0 on", (long long)in[GAIN].d[1]);
     return in[X];
 }
 
 static const dar_norm_opt split_3 = { .eps = 1e-6, .split = 3 }, split_9 = { .eps = 1e-6, .split = 9 };
 static const dar_norm_opt split_66 = { .eps = 1e-6, .split = 66 };
+static const dar_norm_opt later = { .eps = 1e-6, .split = 3, .first = 2 };
+static const dar_norm_opt later_still = { .eps = 1e-6, .split = 3, .first = 7 };
 static const dar_norm_opt split_to_bf16 = { .eps = 1e-6, .split = 2, .cast = true, .out = DAR_BF16 };
 
 #define MODULATE(B, N, R, D)                                                                                           \
@@ -380,6 +384,8 @@ static const dar_sample modulated_samples[] = {
     { .in = MODULATE(2, 5, 2, 3), .attr = &split_9 },  /* a row that nobody uses */
     { .in = MODULATE(2, 5, 2, 17), .attr = &split_to_bf16 },
     { .in = MODULATE(1, 68, 2, 129), .attr = &split_66 }, /* several chunks in each group */
+    { .in = MODULATE(2, 5, 3, 7), .attr = &later },       /* a piece of a clip: its first token is the third */
+    { .in = MODULATE(1, 5, 2, 7), .attr = &later_still }, /* and one that begins after the first row's */
 };
 
 static const dar_error_sample modulated_errors[] = {
