@@ -25,7 +25,8 @@ static const dar_option options[] = {
     { .name = "against", .placeholder = "BUNDLES", .type = DAR_ARG_WORDS, .target = &o.against,
       .help = "bundles with true pictures, or directories of them" },
     { .name = "out", .letter = 'o', .placeholder = "DIR", .type = DAR_ARG_TEXT, .target = &o.out,
-      .help = "directory of the results: report.html, tables.md, metrics.json, metrics.csv, frames.csv, table.csv" },
+      .help = "directory of the results: report.html, sheet.png, tables.md, metrics.json, metrics.csv, frames.csv, "
+      "table.csv" },
     { .name = "overwrite", .type = DAR_ARG_FLAG, .target = &o.overwrite, .help = "replace what is there" },
 
     { .help = "Measures" },
@@ -173,7 +174,7 @@ static dar_status work(dar_eval *v, dar_err *e)
 {
     dar_eval_sheets sheets = { 0 };
     dar_progress p = dar_progress_begin("evaluate", "clips", (double)v->clips);
-    dar_status s = DAR_OK;
+    dar_status s = v->tile ? dar_eval_sheet_begin(v, e) : DAR_OK;
     for (size_t c = 0; c < v->clips && s == DAR_OK; c++) {
         s = dar_eval_clip_run(v, c, e);
         dar_progress_step(&p, (double)c + 1, v->clip[c].name);
@@ -184,6 +185,7 @@ static dar_status work(dar_eval *v, dar_err *e)
     if (s == DAR_OK && sheets.failed) s = dar_fail(e, DAR_ERR_NOMEM, "dar-eval: out of memory for tables");
     if (s == DAR_OK) s = dar_eval_files(v, &sheets, e);
     if (s == DAR_OK && v->tile) s = dar_eval_page(v, &sheets, e);
+    if (s == DAR_OK && v->tile) s = dar_eval_sheet_end(v, e);
     dar_eval_sheets_free(&sheets);
     return s;
 }
@@ -208,6 +210,7 @@ static void free_all(dar_eval *v)
     for (size_t i = 0; v->cell && i < v->methods * v->clips; i++) free(v->cell[i].frame);
     for (size_t i = 0; i < v->files; i++) dar_weights_close(v->weights[i]);
     free(v->weights);
+    dar_sheet_free(&v->sheet);
     free(v->method);
     free(v->clip);
     free(v->cell);

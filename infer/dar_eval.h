@@ -7,6 +7,7 @@
  *   dar_eval_table.c     tables as rows of cells: Markdown
  *   dar_eval_paper.c     which tables there are
  *   dar_eval_file.c      JSON and CSV
+ *   dar_eval_sheet.c     last frames of some clips, methods side by side
  *   dar_eval_page.c      the report in HTML
  *   dar_eval_study.c     a page that asks people
  *   dar_eval_answers.c   what they answered */
@@ -19,6 +20,7 @@
 #include "data/bundle.h"
 #include "data/condition.h"
 #include "data/metric.h"
+#include "data/sheet.h"
 #include "lib/stats.h"
 #include "models/lpips.h"
 
@@ -98,6 +100,7 @@ typedef struct dar_eval {
     size_t base;     /* the method that others are compared with */
     const char *out; /* directory that files go to */
     size_t tile;     /* width of a picture of the report [px]; 0: no report */
+    dar_sheet sheet; /* of the report; rgb NULL: there is none */
 } dar_eval;
 
 static inline dar_eval_cell *dar_eval_at(const dar_eval *v, size_t method, size_t clip)
@@ -194,6 +197,13 @@ dar_interval dar_eval_interval(dar_eval *v, size_t m, size_t base, const dar_eva
 
 dar_status dar_eval_files(dar_eval *v, const dar_eval_sheets *s, dar_err *e);
 dar_status dar_eval_page(dar_eval *v, const dar_eval_sheets *s, dar_err *e);
+
+/* sheet.png: rows are clips, columns frame 0, the true last frame, that of every method. */
+dar_status dar_eval_sheet_begin(dar_eval *v, dar_err *e);
+
+/* Frame t of clip c as method m, or (m = v->methods) the truth, has it, rgb [H, W, 3]; most are not shown. */
+void dar_eval_sheet_show(dar_eval *v, size_t c, size_t m, size_t t, const uint8_t *rgb);
+dar_status dar_eval_sheet_end(dar_eval *v, dar_err *e);
 
 /* ---------------------------------------------------------------- people */
 

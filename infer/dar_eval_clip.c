@@ -74,6 +74,7 @@ static void measure(struct work *w, size_t m, size_t t)
         for (int a = 0; a < DAR_METRIC_AREAS; a++) row->v[a][DAR_EVAL_ALEX + net] = d[a];
     }
     if (w->film) dar_eval_film_add(w->film, 1 + m, t, w->found, dar_metric_map(w->metric));
+    dar_eval_sheet_show(w->v, w->c, m, t, w->found);
 }
 
 size_t dar_eval_same_time(size_t t, size_t to, size_t from)
@@ -168,6 +169,7 @@ static dar_status load_truth(struct work *w, dar_err *e)
     for (size_t t = 0; t < w->frames && s == DAR_OK; t++) {
         s = dar_bundle_rgb(w->b, t, w->truth + 3 * w->pixels * t, e);
         if (s == DAR_OK && w->film) dar_eval_film_add(w->film, 0, t, w->truth + 3 * w->pixels * t, NULL);
+        if (s == DAR_OK) dar_eval_sheet_show(w->v, w->c, w->v->methods, t, w->truth + 3 * w->pixels * t);
         if (s == DAR_OK && w->mask) s = dar_bundle_values(w->b, DAR_FAMILY_MASK, t, cover, e);
         for (size_t i = 0; i < w->pixels && s == DAR_OK && w->mask; i++)
             w->mask[w->pixels * t + i] = cover[i] >= 0.5f ? 255 : 0;

@@ -289,6 +289,7 @@ static void test_report(void **state)
         CHECK(has_id(page, p += 7), "%.40s leads nowhere", p);
     for (const char *p = page; (p = strstr(p, "data-film=\"")); films++) check_film(page, p += 11);
     CHECK(links >= 6 && films == 4, "%zu links, %zu films", links, films);
+    CHECK(run_is_there("page/sheet.png"), "no sheet");
 }
 
 /* ---------------------------------------------------------------- people */
