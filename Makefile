@@ -51,7 +51,7 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
 .PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit bench-vae bench-weights
-.PHONY: bench-train ulp fuzz fuzz-run
+.PHONY: bench-train demo ulp fuzz fuzz-run
 .PHONY: deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -148,6 +148,13 @@ bench-weights: ## a file of random weights of the 5B network, 10.6 GB; bench-dit
 	@$(MAKE) --no-print-directory $B/speed_dit
 	@mkdir -p $(dir $(WEIGHTS))
 	@$B/speed_dit --write $(WEIGHTS)
+
+# ---------------------------------------------------------------- the small model
+JOBS := $(shell nproc)
+
+demo: deps ## scenes rendered, trained on, measured with the shipped weights; MESH=file.glb REFERENCE=picture.png
+	@$(MAKE) --no-print-directory -j$(JOBS) all
+	@MESH='$(MESH)' REFERENCE='$(REFERENCE)' BIN=$B scripts/demo.sh
 
 everything: all $(TESTS:%=$B/%) $B/bench_kernels $(SPEED:%=$B/%) $B/ulp
 
