@@ -51,7 +51,7 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
 .PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit bench-vae bench-weights
-.PHONY: bench-train demo ulp fuzz fuzz-run
+.PHONY: bench-train demo pretrain ulp fuzz fuzz-run
 .PHONY: deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -155,6 +155,10 @@ JOBS := $(shell nproc)
 demo: deps ## scenes rendered, trained on, measured with the shipped weights; MESH=file.glb REFERENCE=picture.png
 	@$(MAKE) --no-print-directory -j$(JOBS) all
 	@MESH='$(MESH)' REFERENCE='$(REFERENCE)' BIN=$B scripts/demo.sh
+
+pretrain: deps ## the weights of models/dar-tiny from nothing, seeded, some 3 hours; cut it and it goes on
+	@$(MAKE) --no-print-directory -j$(JOBS) all
+	@BIN=$B scripts/pretrain.sh
 
 everything: all $(TESTS:%=$B/%) $B/bench_kernels $(SPEED:%=$B/%) $B/ulp
 
