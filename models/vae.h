@@ -64,12 +64,6 @@ typedef struct dar_vae {
 /* Declare all parameters, under the names of the public checkpoint.  *v must stay where it is. */
 void dar_vae_init(dar_vae *v, dar_params *p, const dar_vae_config *c);
 
-/* A place to learn from: the linear maps, if there are any, become the lowest frequencies of the cosine transform of
- * blocks of pixels, scaled to what natural videos hold, so that latents are about 1; the last layers of both halves
- * become 0, so that these maps are all there is at first; the posterior's deviation exp(-3).  After the parameters have
- * their values. */
-void dar_vae_start(dar_vae *v);
-
 /* Fold the decoder's convolutions behind up-sampling (models/double.h), for use when nothing is recorded.  After the
  * parameters have their values; memory in `a`. */
 void dar_vae_fold(dar_vae *v, dar_arena *a);

@@ -3,6 +3,7 @@
 #include "tests/test.h"
 
 #include "lib/rng.h"
+#include "models/vae_start.h"
 #include "train/optim.h"
 #include "train/vae_step.h"
 
@@ -145,6 +146,52 @@ static void test_parts(void **state)
 
 /* ---------------------------------------------------------------- the linear maps */
 
+/* From the components of x, or from the cosine transform. */
+static void start(net *n, const dar_tensor *x, double spread)
+{
+    dar_vae_blocks b;
+    dar_err e;
+    CHECK(dar_vae_blocks_init(&b, &n->v, 6, 4, &e) == DAR_OK, "%s", e.text);
+    if (x) dar_vae_blocks_add(&b, x);
+    dar_vae_start(&b, spread);
+    dar_vae_blocks_free(&b);
+}
+
+/* Clips whose blocks are mixtures of three, all still: three components give them back, where three waves lose most,
+ * and the latents' mean square is 1. */
+static void test_start_finds_components(void **state)
+{
+    const dar_vae_loss plain = { .parts = 1 };
+    dar_vae_sums sums = { 0 };
+    double mean[3], std[3];
+    net n;
+    (void)state;
+    net_init(&n, DAR_F64, 3, &plain, DAR_SHAPE(2, 3, 5, 6, 4));
+    for (uint64_t i = 0; i < dar_tensor_count(&n.x); i++) {
+        uint64_t x = i % 4, y = i / 4 % 6, f = i / 24 % 5, c = i / 120 % 3, clip = i / 360;
+        uint64_t block = ((clip * 3 + (f + 1) / 2) * 3 + y / 2) * 2 + x / 2, place = (c * 2 + y % 2) * 2 + x % 2;
+        double sum = 0;
+        for (uint64_t k = 0; k < 3; k++) sum += dar_rng_normal(4, block, k) * dar_rng_normal(3, k, place) / (1 + k);
+        ((double *)n.x.data)[i] = sum / 16;
+    }
+    start(&n, NULL, 0);
+    double waves = dar_vae_step_look(&n.s, &n.x, NULL).square;
+    start(&n, &n.x, 0);
+    CHECK(waves > 1e-3, "three waves leave %g", waves);
+    CHECK_NEAR("what three components leave", dar_vae_step_look(&n.s, &n.x, &sums).square, 0, 1e-20);
+    dar_vae_standard(&sums, 3, mean, std);
+    for (int k = 0; k < 3; k++) CHECK_NEAR("mean square of a latent", mean[k] * mean[k] + std[k] * std[k], 1, 1e-12);
+
+    sums = (dar_vae_sums){ 0 };
+    start(&n, &n.x, 1);
+    CHECK_NEAR("with their spread", dar_vae_step_look(&n.s, &n.x, &sums).square, 0, 1e-20);
+    double all = (sums.square[0] + sums.square[1] + sums.square[2]) / (3 * sums.n);
+    CHECK_NEAR("mean square of all latents", all, 1, 1e-12);
+    CHECK(sums.square[0] > 1.5 * sums.square[1] && sums.square[1] > 1.5 * sums.square[2], "squares %g, %g, %g",
+          sums.square[0], sums.square[1], sums.square[2]);
+    net_free(&n);
+}
+
 /* With as many latent numbers as pixels the waves are all there, and the maps are each other's inverse: the
  * posterior's mean is the clip. */
 static void test_start_is_a_transform(void **state)
@@ -153,7 +200,7 @@ static void test_start_is_a_transform(void **state)
     net n;
     (void)state;
     net_init(&n, DAR_F64, 24, &plain, DAR_SHAPE(2, 3, 5, 6, 4));
-    dar_vae_start(&n.v);
+    start(&n, NULL, 0);
     dar_rng_fill_uniform(&n.x, 4, 4, -1, 1);
     dar_vae_report r = dar_vae_step_look(&n.s, &n.x, NULL);
     CHECK_NEAR("mean squared distance of a full transform", r.square, 0, 1e-28);
@@ -167,7 +214,7 @@ static void test_start_keeps_what_is_smooth(void **state)
     net n;
     (void)state;
     net_init(&n, DAR_F64, 3, &plain, DAR_SHAPE(1, 3, 3, 6, 4));
-    dar_vae_start(&n.v);
+    start(&n, NULL, 0);
     CHECK(dar_vae_step_look(&n.s, &n.x, NULL).square > 0.1, "three of 24 waves hold noise");
     dar_tensor_fill(&n.x, 0.7);
     CHECK_NEAR("grey", dar_vae_step_look(&n.s, &n.x, NULL).square, 0, 1e-28);
@@ -230,7 +277,7 @@ static void test_overfits(void **state)
     net n;
     (void)state;
     net_init(&n, DAR_F32, 5, &c, DAR_SHAPE(1, 3, 3, 6, 4));
-    dar_vae_start(&n.v);
+    start(&n, NULL, 0);
     dar_optim_init(&optim, &o, &n.p, &n.weights);
     double first = dar_vae_step_look(&n.s, &n.x, NULL).square;
     for (int64_t k = 0; k < 300; k++) {
@@ -281,6 +328,7 @@ int main(void)
         cmocka_unit_test(test_same_bits),
         cmocka_unit_test(test_parts),
         cmocka_unit_test(test_start_is_a_transform),
+        cmocka_unit_test(test_start_finds_components),
         cmocka_unit_test(test_start_keeps_what_is_smooth),
         cmocka_unit_test(test_streams),
         cmocka_unit_test(test_overfits),

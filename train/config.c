@@ -87,6 +87,7 @@ static const row table[] = {
     { "vae", "edge", NUMBER, AT(vae_edge), 0, 0, 1e3, NULL },
     { "vae", "kl", NUMBER, AT(vae_kl), 1e-5, 0, 1e3, NULL },
     { "vae", "noise", NUMBER, AT(vae_noise), 0, 0, 1e3, NULL },
+    { "vae", "spread", NUMBER, AT(vae_spread), 0, 0, 1, NULL },
 
     { "validation", "steps", INT, AT(validate_every), 1000, 0, COUNT, NULL },
     { "validation", "clips", INT, AT(validate_clips), 4, 1, 1 << 20, NULL },

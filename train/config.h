@@ -61,6 +61,7 @@
  *   vae.edge                     >= 0             0        weight of the distance of slopes
  *   vae.kl                       >= 0             1e-5     weight of the divergence
  *   vae.noise                    >= 0             0        added to latents before they are decoded
+ *   vae.spread                   0 to 1           0        of latents, from nothing (models/vae_start.h)
  *
  *   validation.data              list of texts    []       bundles to look at while training
  *   validation.steps             0 ..             1000     every so many steps; 0: never
@@ -124,7 +125,7 @@ typedef struct dar_train_config {
     int posterior; /* 0: mean, 1: sample */
 
     int64_t vae_frames, vae_height, vae_width;
-    double vae_round, vae_edge, vae_kl, vae_noise;
+    double vae_round, vae_edge, vae_kl, vae_noise, vae_spread;
 
     int64_t validate_every, validate_clips, validate_steps, sensitivity;
 

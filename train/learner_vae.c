@@ -8,6 +8,7 @@
 
 #include "lib/log.h"
 #include "models/load.h"
+#include "models/vae_start.h"
 #include "train/vae_step.h"
 
 #define MEASURED 64 /* clips whose latents are measured, at most */
@@ -46,7 +47,6 @@ static dar_status network(dar_loop *l, bool plan, dar_err *e)
         return dar_fail(e, DAR_ERR_USAGE,
                         "parts.vae: found none, expected weights to go on from, or from_scratch=true");
     dar_params_fresh(p, DAR_PARAM_ALL, (uint64_t)c->seed);
-    if (!path && !plan) dar_vae_start(&t->vae);
     dar_params_gradients(p);
     if (plan) l->plan.weights = t->weights.peak;
     l->params = p;
@@ -150,6 +150,14 @@ static dar_status set_numbers(dar_json_doc *doc, const char *key, const double *
     return s;
 }
 
+/* Numbers that differ in size on purpose stay so: they share the root of their mean square. */
+static void one_deviation(double *std, int64_t n)
+{
+    double sum = 0;
+    for (int64_t i = 0; i < n; i++) sum += std[i] * std[i];
+    for (int64_t i = 0; i < n; i++) std[i] = sqrt(sum / (double)n);
+}
+
 /* Latents of whole clips, and what that says of the model. */
 static dar_status describe(dar_loop *l, dar_json_doc *model, dar_err *e)
 {
@@ -163,6 +171,7 @@ static dar_status describe(dar_loop *l, dar_json_doc *model, dar_err *e)
         dar_vae_step_look(&t->look, &b->pixels, &sums);
     }
     dar_vae_standard(&sums, C, mean, std);
+    if (l->c->vae_spread > 0) one_deviation(std, C);
     DAR_TRY(set_numbers(model, "vae.mean", mean, C, e));
     DAR_TRY(set_numbers(model, "vae.std", std, C, e));
     return dar_json_set(model, "weights.vae=vae.safetensors", e);
@@ -170,12 +179,30 @@ static dar_status describe(dar_loop *l, dar_json_doc *model, dar_err *e)
 
 /* ---------------------------------------------------------------- a run */
 
+/* From nothing: from what linear maps can do for the clips. */
+static dar_status start(dar_loop *l, dar_err *e)
+{
+    state *t = l->state;
+    const dar_shape all = dar_loader_pixels(t->measured);
+    dar_vae_blocks b;
+    dar_status s = dar_vae_blocks_init(&b, &t->vae, all.d[3], all.d[4], e);
+    for (size_t i = 0; s == DAR_OK && i < l->clips.n && i < MEASURED; i++) {
+        const dar_batch *clip;
+        s = dar_loader_get(t->measured, (int64_t)i, &clip, e);
+        if (s == DAR_OK) dar_vae_blocks_add(&b, &clip->pixels);
+    }
+    if (s == DAR_OK) dar_vae_start(&b, l->c->vae_spread);
+    dar_vae_blocks_free(&b);
+    return s;
+}
+
 static dar_status prepare(dar_loop *l, bool plan, dar_err *e)
 {
     state *t = l->state;
     const dar_vae_loss loss = loss_of(l->c);
     DAR_TRY(open_loaders(l, plan, e));
     if (plan) return count(l, e);
+    if (!t->file && !l->saver.step) DAR_TRY(start(l, e));
     t->vae.whole = l->plan.how == DAR_RECOMPUTE_NONE;
     DAR_TRY(dar_vae_step_init(&t->step, &t->vae, &loss, dar_loader_pixels(t->loader), false, e));
     return dar_vae_step_init(&t->look, &t->vae, &looked, dar_loader_pixels(t->measured), false, e);
