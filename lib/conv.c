@@ -1,24 +1,23 @@
-/* conv.c: convolution by the virtual operand col: y with a stride in time, gx with strides, and gw. */
+/* conv.c: convolution by the virtual operand col: y with a stride in time, and gx with strides. */
 #include "lib/conv.h"
 
 #include <string.h>
 
 #include "lib/conv_clip.h"
 #include "lib/conv_slide.h"
+#include "lib/conv_weights.h"
 #include "lib/kern.h"
 #include "lib/size.h"
 #include "lib/thread.h"
 #include "lib/tile.h"
 
-#define DEPTH  512  /* longest piece of a sum in one tile call of forward: a stripe of B stays near */
-#define PIXELS 256  /* output pixels at a time; with DEPTH of them B fills half of a 1 MiB second-level cache */
-#define ROWS   512  /* most rows of the result per task */
-#define TASKS  16   /* wanted at least, */
-#define LITTLE 96   /* but none with fewer rows: they pay for packing B */
-#define FILL   16   /* rows of col made at a time before they are packed: first-level cache */
-#define BESIDE 16   /* elements between rows of col, so that they do not share their place in the cache */
-#define FLUSH  8192 /* pixels summed in one accumulator before it goes to gw: bounds the error of long sums */
-#define LINE   16   /* columns of gw^T turned at a time: a cache line of f32 */
+#define DEPTH  512 /* longest piece of a sum in one tile call of forward: a stripe of B stays near */
+#define PIXELS 256 /* output pixels at a time; with DEPTH of them B fills half of a 1 MiB second-level cache */
+#define ROWS   512 /* most rows of the result per task */
+#define TASKS  16  /* wanted at least, */
+#define LITTLE 96  /* but none with fewer rows: they pay for packing B */
+#define FILL   16  /* rows of col made at a time before they are packed: first-level cache */
+#define BESIDE 16  /* elements between rows of col, so that they do not share their place in the cache */
 
 /* ---------------------------------------------------------------- the job: what all products share */
 
@@ -74,29 +73,18 @@ static void cut_channels(struct job *j)
     j->a_bytes = dar_round_up(dar_blocks(j->m, j->tile->mr) * dar_tile_bytes_a(j->tile, j->c.Cout), DAR_ALIGN);
 }
 
-/* gw^T, by blocks: a task sums over all pixels. */
-static void cut_weights(struct job *j)
-{
-    j->n = dar_even_block(j->c.Cout, PIXELS, j->tile->nr, 1, 1);
-    j->m = dar_even_block(j->K, ROWS, j->tile->mr, dar_blocks(TASKS, dar_blocks(j->c.Cout, j->n)), 2 * LITTLE);
-    j->depth = PIXELS;
-    j->a_bytes = dar_round_up(j->m * j->depth * dar_dtype_size(j->operand), DAR_ALIGN);
-    j->col_bytes = dar_round_up(LINE * (j->m + LINE) * dar_dtype_size(j->sum), DAR_ALIGN);
-}
-
 static struct job job_of(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_dtype w)
 {
     static const dar_dtype of[] = { [DAR_TILE_F64] = DAR_F64, [DAR_TILE_F32] = DAR_F32, [DAR_TILE_BF16] = DAR_BF16 };
     dar_tile_kind kind = dar_tile_kind_for(x == DAR_BF16 && w != DAR_BF16 ? DAR_F32 : x);
     struct job j = { .c = *c, .operand = of[kind], .sum = dar_compute_type(x), .taps = c->kt * c->kh * c->kw };
 
-    j.col = pass == DAR_CONV_FORWARD ? x : pass == DAR_CONV_BACK_X ? j.sum : j.operand;
+    j.col = pass == DAR_CONV_FORWARD ? x : j.sum;
     j.K = j.c.Cin * j.taps;
     j.P = j.c.To * j.c.Ho * j.c.Wo;
-    j.tile = dar_tile_for(kind, pass == DAR_CONV_BACK_W ? c->Cout : c->B * j.P);
+    j.tile = dar_tile_for(kind, c->B * j.P);
     if (pass == DAR_CONV_FORWARD) cut_pixels(&j, w);
-    else if (pass == DAR_CONV_BACK_X) cut_channels(&j);
-    else cut_weights(&j);
+    else cut_channels(&j);
     j.b_bytes = dar_round_up((dar_blocks(j.n, j.tile->nr) * j.tile->nr + BESIDE) * dar_tile_units(j.tile, j.depth) *
                                  j.tile->unit_bytes,
                              DAR_ALIGN);
@@ -140,6 +128,7 @@ size_t dar_conv_scratch(const dar_conv *c, dar_conv_pass pass, dar_dtype x, dar_
         dar_conv_slide s = slide_of(c, pass, x, w);
         return dar_conv_slide_scratch(&s, threads);
     }
+    if (pass == DAR_CONV_BACK_W) return dar_conv_weights_scratch(c, x, w, threads);
     struct job j = job_of(c, pass, x, w);
     return j.shared + (size_t)threads * own_bytes(&j);
 }
@@ -520,89 +509,7 @@ void dar_conv_back_x(const dar_conv *c, dar_dtype x_type, const dar_tensor *w, c
     dar_parallel(c->B * dar_blocks(c->Cin, f.j.m / f.j.taps), back_x_task, &f);
 }
 
-/* ---------------------------------------------------------------- gw, gb */
-
-struct back_w {
-    struct job j;
-    dar_clip x;
-    const dar_tensor *gy, *gw;
-    bool add;
-    char *scratch;
-};
-
-/* gw[o0.., k0..] (+)= c transposed, a line of c at a time. */
-static void store_gw(const struct back_w *f, size_t k0, size_t m, size_t o0, size_t n, const struct room *r, bool add)
-{
-    const struct job *j = &f->j;
-    size_t ld = j->m + LINE; /* not a power of two: the rows would share their place in the cache */
-
-    for (size_t o = 0; o < n; o += LINE) {
-        size_t lines = dar_least(LINE, n - o);
-        for (size_t k = 0; k < m; k++)
-            for (size_t u = 0; u < lines; u++)
-                if (j->sum == DAR_F64)
-                    ((double *)(void *)r->col)[u * ld + k] = ((double *)(void *)r->c)[k * j->n + o + u];
-                else ((float *)(void *)r->col)[u * ld + k] = ((float *)(void *)r->c)[k * j->n + o + u];
-        for (size_t u = 0; u < lines; u++)
-            dar_row_put(j->sum, r->col + u * ld * dar_dtype_size(j->sum), f->gw->dtype,
-                        (char *)f->gw->data + ((o0 + o + u) * j->K + k0) * dar_dtype_size(f->gw->dtype), m,
-                        add ? DAR_PUT_ADD : DAR_PUT);
-    }
-}
-
-/* Rows k0.. of col at n pixels of one batch element, as the tile reads them: whole units, the rest zero.  Meanwhile
- * `rows` of gy are asked for, `bytes` each, for the next pixels. */
-static void fill_col(const struct back_w *f, size_t k0, size_t m, size_t q, size_t n, char *a, const char *gy,
-                     size_t rows, size_t bytes)
-{
-    const struct job *j = &f->j;
-    size_t size = dar_dtype_size(j->operand), pad = dar_tile_units(j->tile, n) * j->tile->unit - n;
-    struct at p = at_of(&j->c, q);
-
-    for (size_t k = 0; k < m; k++, a += j->depth * size) {
-        struct tap e = tap_of(j, k0 + k);
-        fill_row(j, &e, p, n, &f->x, a);
-        dar_clip_zero(a + n * size, pad, size);
-        if (k < rows) dar_row_ahead(gy + k * j->P * dar_dtype_size(f->gy->dtype), bytes);
-    }
-}
-
-static void back_w_task(void *ctx, size_t i, int thread)
-{
-    const struct back_w *f = ctx;
-    const struct job *j = &f->j;
-    const dar_tile *t = j->tile;
-    size_t Cout = j->c.Cout, across = dar_blocks(Cout, j->n), o0 = i % across * j->n, k0 = i / across * j->m;
-    size_t m = dar_least(j->m, j->K - k0), n = dar_least(j->n, Cout - o0), gs = dar_dtype_size(f->gy->dtype),
-           summed = 0;
-    struct room r = room_of(j, f->scratch, thread);
-    struct lhs a = { r.a, j->depth / t->unit, 1, j->depth / t->unit * t->mr };
-    bool add = f->add;
-
-    for (size_t batch = 0; batch < j->c.B; batch++)
-        for (size_t p = 0; p < j->P; p += j->depth) {
-            size_t depth = dar_least(j->depth, j->P - p);
-            const char *gy = (char *)f->gy->data + ((batch * Cout + o0) * j->P + p) * gs;
-            for (size_t q = 0; q < n; q += t->nr)
-                dar_tile_pack_b_nk(t, f->gy->dtype, gy + q * j->P * gs, j->P, depth, dar_least(t->nr, n - q),
-                                   r.b + q / t->nr * dar_tile_bytes_b(t, j->depth));
-            fill_col(f, k0, m, batch * j->P + p, depth, r.a, gy + depth * gs, n,
-                     dar_least(j->depth, j->P - p - depth) * gs);
-            multiply(j, a, packed_rhs(j, r.b), m, n, depth, r.c, summed > 0);
-            summed += depth;
-            if (summed < FLUSH && (p + depth < j->P || batch + 1 < j->c.B)) continue;
-            store_gw(f, k0, m, o0, n, &r, add);
-            add = true;
-            summed = 0;
-        }
-}
-
-void dar_conv_back_w(const dar_conv *c, const dar_tensor *x, const dar_tensor *history, dar_dtype w_type,
-                     const dar_tensor *gy, const dar_tensor *gw, bool add, void *scratch)
-{
-    struct back_w f = { job_of(c, DAR_CONV_BACK_W, x->dtype, w_type), clip_of(c, x, history), gy, gw, add, scratch };
-    dar_parallel(dar_blocks(f.j.K, f.j.m) * dar_blocks(c->Cout, f.j.n), back_w_task, &f);
-}
+/* ---------------------------------------------------------------- gb */
 
 struct back_b {
     const dar_conv *c;

@@ -1,10 +1,10 @@
 /* conv.h: convolution in two and three dimensions as a product.
  *
  * With K = Cin kt kh kw taps and P = To Ho Wo output pixels per batch element, y[Cout, P] = w[Cout, K] col[K, P], where
- * col are the shifted input rows.  gw^T = col gy^T.  gx is the convolution of gy with the kernel turned round; where a
- * stride is not 1, gcol = w^T gy, added back to where the taps came from.  A frame alone is T = kt = To = 1.
- * Without a stride in time y is made without col, and with strides of 1 gx too: lib/conv_slide.h.  Elsewhere col exists
- * only in pieces that fit the second-level cache.
+ * col are the shifted input rows.  gw^T = col gy^T (lib/conv_weights.c).  gx is the convolution of gy with the kernel
+ * turned round; where a stride is not 1, gcol = w^T gy, added back to where the taps came from.  A frame alone is T =
+ * kt = To = 1. Without a stride in time y is made without col, and with strides of 1 gx too: lib/conv_slide.h.
+ * Elsewhere col exists only in pieces that fit the second-level cache.
  *
  * Products run in bf16 if x and w are stored so, else in x's arithmetic type; sums in that type, k ascending in fixed
  * blocks, so a frame's result depends neither on the number of threads nor on the frames it is evaluated with. */

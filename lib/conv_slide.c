@@ -1,15 +1,13 @@
 /* conv_slide.c: how the sliding convolution is cut.
  *
- *   a frame in runs     of pixels, row by row, with the zeros between the rows: what they make is not stored
+ *   a frame in runs     of places (lib/conv_grid.h); what those between the rows make is not stored
  *   channels in blocks  of x: packed for a run in all frames of the kernel, they fit half of the second-level cache
  *   tiles               pixels first: rows of w stay in the first-level cache, pixels stream past them
- *
- * With a stride S in space a frame is S x S pictures, its phases: tap (i, j) is at (i / S, j / S) of phase (i mod S,
- * j mod S), and each of those is packed for itself.
  *
  * How channels are cut does not depend on the number of frames. */
 #include "lib/conv_slide.h"
 
+#include "lib/conv_grid.h"
 #include "lib/kern.h"
 #include "lib/size.h"
 #include "lib/thread.h"
@@ -31,11 +29,9 @@ struct job {
     const dar_conv_slide *s;
     const dar_conv *c;
     const dar_tile *tile;
-    dar_dtype operand, sum;              /* types of packed operands and of the result */
-    size_t taps, units;                  /* kt kh kw; units of channels */
-    size_t tall, wide, phases;           /* phases that the kernel reads, along rows and along columns, and in all */
-    size_t kh, kw;                       /* of the kernel in one phase */
-    size_t pitch, plane;                 /* pixels from row to row; of an output frame */
+    dar_dtype operand, sum; /* types of packed operands and of the result */
+    size_t taps, units;     /* kt kh kw; units of channels */
+    dar_conv_grid grid;
     size_t m, n, down, runs;             /* rows and pixels of a task, tasks along rows and along pixels */
     size_t ld, depth;                    /* distance of channels in packed pixels, units of a block */
     bool packs_a;                        /* w is copied; else it is read where it lies */
@@ -46,39 +42,29 @@ struct job {
     char *a, *own;
 };
 
-/* Zeros after a row are those before the next one, and enough for the last output columns.  Rows of a phase begin with
- * what the first output column reads. */
-static size_t pitch_of(const dar_conv *c, size_t kw)
-{
-    if (c->stride > 1) return c->Wo + kw - 1;
-    size_t left = c->left > 0 ? (size_t)c->left : 0;
-    int64_t end = (int64_t)(c->Wo + c->kw) - 1 - c->left;
-    return dar_most(dar_most(c->W + left, c->Wo), end > 0 ? (size_t)end : 0);
-}
-
 /* Pixels in a packed run of n: whole lines, and an odd number of them, since channels would share their place in the
  * cache. */
 static size_t packed_run(const struct job *j, size_t n)
 {
-    size_t line = DAR_ALIGN / j->tile->unit_bytes, around = (j->kh - 1) * j->pitch + j->kw - 1;
-    return (dar_blocks(n + around, line) | 1) * line;
+    size_t line = DAR_ALIGN / j->tile->unit_bytes;
+    return (dar_blocks(n + j->grid.around, line) | 1) * line;
 }
 
 static void cut(struct job *j)
 {
     const dar_conv *c = j->c;
     const dar_tile *t = j->tile;
-    size_t around = AROUND * (j->kh - 1) * j->pitch, elem = dar_dtype_size(j->sum);
+    size_t around = AROUND * (j->grid.kh - 1) * j->grid.pitch, elem = dar_dtype_size(j->sum);
     size_t limit = C_BYTES / elem / dar_most(dar_least(c->Cout, ROWS), 1), frames = c->B * c->To;
 
     limit = dar_most(dar_least(limit, around), PIXELS);
-    j->n = dar_even_block(j->plane, limit, t->nr, dar_blocks(TASKS, dar_most(frames, 1)), PIXELS);
-    j->runs = dar_blocks(j->plane, j->n);
+    j->n = dar_even_block(j->grid.plane, limit, t->nr, dar_blocks(TASKS, dar_most(frames, 1)), PIXELS);
+    j->runs = dar_blocks(j->grid.plane, j->n);
     j->m = dar_even_block(c->Cout, ROWS, t->mr, dar_blocks(TASKS, dar_most(frames * j->runs, 1)), LITTLE);
     j->down = dar_blocks(c->Cout, j->m);
     j->ld = packed_run(j, j->n);
 
-    size_t fit = B_BYTES / (c->kt * j->phases * packed_run(j, dar_least(limit, j->plane)) * t->unit_bytes);
+    size_t fit = B_BYTES / (c->kt * j->grid.phases * packed_run(j, dar_least(limit, j->grid.plane)) * t->unit_bytes);
     j->depth = dar_most(dar_least(fit, STEPS / j->taps), 1);
     j->depth = dar_most(dar_blocks(j->units, dar_most(dar_blocks(j->units, j->depth), 1)), 1);
 }
@@ -91,14 +77,8 @@ static struct job job_of(const dar_conv_slide *s)
     struct job j = { .s = s, .c = c, .operand = of[kind], .sum = dar_compute_type(s->x_type) };
 
     j.taps = c->kt * c->kh * c->kw;
-    j.tall = dar_least(c->stride, c->kh);
-    j.wide = dar_least(c->stride, c->kw);
-    j.phases = j.tall * j.wide;
-    j.kh = dar_blocks(c->kh, c->stride);
-    j.kw = dar_blocks(c->kw, c->stride);
-    j.pitch = pitch_of(c, j.kw);
-    j.plane = c->Ho && c->Wo ? (c->Ho - 1) * j.pitch + c->Wo : 0;
-    j.tile = dar_tile_fit(kind, c->Cout, dar_round_up(j.plane, 32)); /* tiles of 16 columns read w too often */
+    j.grid = dar_conv_grid_of(c);
+    j.tile = dar_tile_fit(kind, c->Cout, dar_round_up(j.grid.plane, 32)); /* tiles of 16 columns read w too often */
     j.units = dar_tile_units(j.tile, c->Cin);
     cut(&j);
 
@@ -107,7 +87,7 @@ static struct job job_of(const dar_conv_slide *s)
     j.row = j.packs_a ? (dar_blocks(j.units * j.taps, line) | 1) * line : j.units * j.taps;
     j.at_bytes = dar_round_up(j.taps * sizeof *j.at, DAR_ALIGN);
     j.a_bytes = j.packs_a ? c->Cout * j.row * unit : 0;
-    j.b_bytes = c->kt * j.phases * j.depth * j.ld * unit;
+    j.b_bytes = c->kt * j.grid.phases * j.depth * j.ld * unit;
     j.c_bytes = dar_round_up(j.m * j.n * dar_dtype_size(j.sum), DAR_ALIGN);
     j.fill_bytes = dar_round_up(FILL * j.ld * sizeof(double), DAR_ALIGN);
     return j;
@@ -146,69 +126,9 @@ static void pack_weights(void *ctx, size_t begin, size_t end, int thread)
 
 /* ---------------------------------------------------------------- pixels */
 
-/* n elements from place `at` of a frame whose rows are `pitch` apart: zero between and outside them. */
-static void fill(const struct job *j, dar_dtype type, char *dst, const char *frame, int64_t at, size_t n)
-{
-    const dar_conv *c = &j->s->c;
-    size_t W = c->W, H = c->H, pitch = j->pitch, size = dar_dtype_size(type);
-    size_t before = at < 0 ? dar_least((size_t)-at, n) : 0;
-
-    if (W == pitch) W *= H, pitch = W, H = 1;
-    dar_clip_zero(dst, before, size);
-    dst += before * size;
-    n -= before;
-    size_t p = at < 0 ? 0 : (size_t)at, h = p / pitch, w = p % pitch;
-    for (; n && h < H; h++, w = 0) {
-        size_t copy = w < W ? dar_least(W - w, n) : 0, gap = dar_least(pitch - w - copy, n - copy);
-        if (copy) memcpy(dst, frame + (h * W + w) * size, copy * size);
-        dar_clip_zero(dst + copy * size, gap, size);
-        dst += (copy + gap) * size;
-        n -= copy + gap;
-    }
-    dar_clip_zero(dst, n, size);
-}
-
-/* n elements, `step` apart in src. */
-static void take(size_t size, size_t n, const void *src, size_t step, void *dst)
-{
-#define TAKE(T)                                                                                                        \
-    if (step == 2)                                                                                                     \
-        for (size_t i = 0; i < n; i++) ((T *)dst)[i] = ((const T *)src)[2 * i];                                        \
-    else                                                                                                               \
-        for (size_t i = 0; i < n; i++) ((T *)dst)[i] = ((const T *)src)[i * step]
-    if (size == 2) TAKE(uint16_t);
-    else if (size == 4) TAKE(uint32_t);
-    else TAKE(uint64_t);
-#undef TAKE
-}
-
-/* n elements from place `at` of a phase: its row h, column w are row h S + y, column w S + x of the frame. */
-static void fill_phase(const struct job *j, dar_dtype type, char *dst, const char *frame, size_t phase, size_t at,
-                       size_t n)
-{
-    const dar_conv *c = &j->s->c;
-    size_t size = dar_dtype_size(type), S = c->stride;
-    int64_t y = (int64_t)(phase / j->wide + at / j->pitch * S) - c->top, x = (int64_t)(phase % j->wide) - c->left;
-    size_t first = x < 0 ? dar_blocks((size_t)-x, S) : 0, last = (int64_t)c->W > x ? dar_blocks(c->W - x, S) : 0;
-
-    for (size_t w = at % j->pitch; n; y += (int64_t)S, w = 0) {
-        size_t end = dar_least(j->pitch, w + n), low = dar_least(dar_most(w, first), end);
-        size_t high = dar_most(dar_least(last, end), low);
-        if (y < 0 || y >= (int64_t)c->H) low = high = end;
-        dar_clip_zero(dst, low - w, size);
-        if (high > low)
-            take(size, high - low, frame + (y * (int64_t)c->W + (int64_t)(low * S) + x) * (int64_t)size, S,
-                 dst + (low - w) * size);
-        dar_clip_zero(dst + (high - w) * size, end - high, size);
-        dst += (end - w) * size;
-        n -= end - w;
-    }
-}
-
 /* Rows r0.. of w, pixels q0.. of an output frame. */
 struct task {
     size_t batch, t, r0, m, q0, n;
-    int64_t first; /* place of the first pixel that it reads, in frames; of phases it is q0 */
     char *b, *c, *buf;
 };
 
@@ -236,8 +156,7 @@ static void pack_frame(const struct job *j, const struct task *w, int64_t t, siz
         char *rows = as_is ? b + i * row : w->buf;
         for (size_t c = 0; c < k; c++) {
             const char *frame = dar_clip_frame(&j->s->in, w->batch, c0 + i + c, t, &type);
-            if (j->c->stride == 1) fill(j, type, rows + c * row, frame, w->first, j->ld);
-            else fill_phase(j, type, rows + c * row, frame, phase, w->q0, j->ld);
+            dar_conv_grid_read(&j->grid, phase, type, rows + c * row, frame, w->q0, j->ld);
         }
         if (!as_is)
             dar_tile_pack_b_wide(tile, type, rows, j->ld, k, j->ld, j->ld,
@@ -252,8 +171,8 @@ static void pack_frame(const struct job *j, const struct task *w, int64_t t, siz
 static void ahead(const struct job *j, const struct task *w, size_t u, size_t piece)
 {
     const dar_conv *c = j->c;
-    size_t channel = u * j->tile->unit + piece / c->kt, rows = dar_blocks(j->ld, j->pitch) * c->stride;
-    int64_t first = c->stride == 1 ? w->first / (int64_t)j->pitch : (int64_t)(w->q0 / j->pitch * c->stride) - c->top;
+    size_t channel = u * j->tile->unit + piece / c->kt, rows = dar_blocks(j->ld, j->grid.pitch) * c->stride;
+    int64_t first = (int64_t)(w->q0 / j->grid.pitch * c->stride) - c->top;
     size_t row = first < 0 ? 0 : (size_t)first;
     dar_dtype type;
 
@@ -301,8 +220,9 @@ static void store(const struct job *j, const struct task *w)
         if (!to) return;
         if (bias) k->offset(w->n, dar_dtype_get(s->b->dtype, s->b->data, o), row, row);
         for (size_t i = 0, step; i < w->n; i += step) {
-            size_t h = (w->q0 + i) / j->pitch, x = (w->q0 + i) % j->pitch, n = x < Wo ? dar_least(Wo - x, w->n - i) : 0;
-            step = j->pitch - x;
+            size_t h = (w->q0 + i) / j->grid.pitch, x = (w->q0 + i) % j->grid.pitch,
+                   n = x < Wo ? dar_least(Wo - x, w->n - i) : 0;
+            step = j->grid.pitch - x;
             if (n) dar_row_put(j->sum, row + i * size, type, to + (h * Wo + x) * dar_dtype_size(type), n, mode);
         }
     }
@@ -315,18 +235,17 @@ static void task(void *ctx, size_t i, int thread)
     struct task w = { .r0 = i % j->down * j->m, .q0 = i / j->down % j->runs * j->n };
     size_t frame = i / j->down / j->runs, bytes = j->tile->unit_bytes;
 
-    w.first = (int64_t)w.q0 - c->left - c->top * (int64_t)j->pitch;
     w.t = frame % c->To;
     w.batch = frame / c->To;
     w.m = dar_least(j->m, c->Cout - w.r0);
-    w.n = dar_least(j->n, j->plane - w.q0);
+    w.n = dar_least(j->n, j->grid.plane - w.q0);
     w.b = j->own + (size_t)thread * own_bytes(j);
     w.c = w.b + j->b_bytes;
     w.buf = w.c + j->c_bytes;
     for (size_t u = 0; u == 0 || u < j->units; u += j->depth) { /* of no channels: zeros */
         size_t units = dar_least(j->depth, j->units - u);
-        for (size_t k = 0; k < c->kt * j->phases; k++)
-            pack_frame(j, &w, frame_at(c, &w, k / j->phases), k % j->phases, u, units,
+        for (size_t k = 0; k < c->kt * j->grid.phases; k++)
+            pack_frame(j, &w, frame_at(c, &w, k / j->grid.phases), k % j->grid.phases, u, units,
                        w.b + k * j->depth * j->ld * bytes);
         multiply(j, &w, u, units);
     }
@@ -345,8 +264,8 @@ void dar_conv_slide_run(const dar_conv_slide *s, void *scratch)
     j.own = j.a + j.a_bytes;
     for (size_t i = 0; i < j.taps; i++) {
         size_t tap = s->turned ? j.taps - 1 - i : i, kt = tap / c->kw / c->kh, y = tap / c->kw % c->kh, x = tap % c->kw;
-        size_t phase = y % c->stride * j.wide + x % c->stride;
-        j.at[i] = (kt * j.phases + phase) * j.depth * j.ld + y / c->stride * j.pitch + x / c->stride;
+        size_t phase = dar_conv_grid_phase(&j.grid, y, x);
+        j.at[i] = (kt * j.grid.phases + phase) * j.depth * j.ld + dar_conv_grid_place(&j.grid, y, x);
     }
     if (j.packs_a) dar_parallel_range(c->Cout, TURN, pack_weights, &j);
     dar_parallel(all, task, &j);

@@ -32,12 +32,10 @@ DEF_BLAS(mm_sgemm, float, cblas_sgemm)
 #define BLAS_ROWS 48
 #define BLAS_COLS 96
 
-static const dar_tile blas_f64 = {
-    "f64 openblas", DAR_TILE_F64, 1, 8, BLAS_ROWS, BLAS_COLS, mm_dgemm, NULL, NULL, NULL
-};
-static const dar_tile blas_f32 = {
-    "f32 openblas", DAR_TILE_F32, 1, 4, BLAS_ROWS, BLAS_COLS, mm_sgemm, NULL, NULL, NULL
-};
+static const dar_tile blas_f64 = { "f64 openblas", DAR_TILE_F64, 1,    8,    BLAS_ROWS, BLAS_COLS,
+                                   mm_dgemm,       NULL,         NULL, NULL, NULL };
+static const dar_tile blas_f32 = { "f32 openblas", DAR_TILE_F32, 1,    4,    BLAS_ROWS, BLAS_COLS,
+                                   mm_sgemm,       NULL,         NULL, NULL, NULL };
 
 static const dar_tile *choose_tile(dar_tile_kind kind, size_t m, size_t n)
 {

@@ -27,6 +27,8 @@ TILE_BESIDE(mm_6x16_beside, 6, 2)
 TILE_BESIDE(mm_12x8_beside, 12, 1)
 TILE_TAPS(mm_6x16_taps, 6, 2)
 TILE_TAPS(mm_12x8_taps, 12, 1)
+TILE_ROWS(mm_6x16_rows, 6, 2)
+TILE_ROWS(mm_12x8_rows, 12, 1)
 
 static inline units along_f32(const void *p, size_t n)
 {
@@ -57,7 +59,7 @@ static const dar_packers pack = {
 };
 
 static const dar_tile of[] = {
-    { "f32 6x16 avx2", DAR_TILE_F32, 1, 4, 6, 16, mm_6x16, &pack, mm_6x16_beside, mm_6x16_taps },
-    { "f32 12x8 avx2", DAR_TILE_F32, 1, 4, 12, 8, mm_12x8, &pack, mm_12x8_beside, mm_12x8_taps },
+    { "f32 6x16 avx2", DAR_TILE_F32, 1, 4, 6, 16, mm_6x16, &pack, mm_6x16_beside, mm_6x16_taps, mm_6x16_rows },
+    { "f32 12x8 avx2", DAR_TILE_F32, 1, 4, 12, 8, mm_12x8, &pack, mm_12x8_beside, mm_12x8_taps, mm_12x8_rows },
 };
 const dar_tile_set dar_tiles_f32_avx2 = { of, 2 };

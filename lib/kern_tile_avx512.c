@@ -33,6 +33,10 @@ TILE_TAPS(mm_6x64_taps, 6, 4)
 TILE_TAPS(mm_8x48_taps, 8, 3)
 TILE_TAPS(mm_12x32_taps, 12, 2)
 TILE_TAPS(mm_12x16_taps, 12, 1)
+TILE_ROWS(mm_6x64_rows, 6, 4)
+TILE_ROWS(mm_8x48_rows, 8, 3)
+TILE_ROWS(mm_12x32_rows, 12, 2)
+TILE_ROWS(mm_12x16_rows, 12, 1)
 
 static inline units along_f32(const void *p, size_t n)
 {
@@ -64,9 +68,9 @@ static const dar_packers pack = {
 };
 
 static const dar_tile of[] = {
-    { "f32 6x64 avx512", DAR_TILE_F32, 1, 4, 6, 64, mm_6x64, &pack, mm_6x64_beside, mm_6x64_taps },
-    { "f32 8x48 avx512", DAR_TILE_F32, 1, 4, 8, 48, mm_8x48, &pack, mm_8x48_beside, mm_8x48_taps },
-    { "f32 12x32 avx512", DAR_TILE_F32, 1, 4, 12, 32, mm_12x32, &pack, mm_12x32_beside, mm_12x32_taps },
-    { "f32 12x16 avx512", DAR_TILE_F32, 1, 4, 12, 16, mm_12x16, &pack, mm_12x16_beside, mm_12x16_taps },
+    { "f32 6x64 avx512", DAR_TILE_F32, 1, 4, 6, 64, mm_6x64, &pack, mm_6x64_beside, mm_6x64_taps, mm_6x64_rows },
+    { "f32 8x48 avx512", DAR_TILE_F32, 1, 4, 8, 48, mm_8x48, &pack, mm_8x48_beside, mm_8x48_taps, mm_8x48_rows },
+    { "f32 12x32 avx512", DAR_TILE_F32, 1, 4, 12, 32, mm_12x32, &pack, mm_12x32_beside, mm_12x32_taps, mm_12x32_rows },
+    { "f32 12x16 avx512", DAR_TILE_F32, 1, 4, 12, 16, mm_12x16, &pack, mm_12x16_beside, mm_12x16_taps, mm_12x16_rows },
 };
 const dar_tile_set dar_tiles_f32_avx512 = { of, 4 };

@@ -30,6 +30,10 @@ TILE_TAPS(mm_6x64_taps, 6, 4)
 TILE_TAPS(mm_8x48_taps, 8, 3)
 TILE_TAPS(mm_12x32_taps, 12, 2)
 TILE_TAPS(mm_12x16_taps, 12, 1)
+TILE_ROWS(mm_6x64_rows, 6, 4)
+TILE_ROWS(mm_8x48_rows, 8, 3)
+TILE_ROWS(mm_12x32_rows, 12, 2)
+TILE_ROWS(mm_12x16_rows, 12, 1)
 
 /* n <= 16 elements as f32. */
 static inline __m512 get_f32(const void *p, size_t n)
@@ -110,9 +114,9 @@ static const dar_packers pack = {
 };
 
 static const dar_tile of[] = {
-    { "bf16 6x64 avx512", DAR_TILE_BF16, 2, 4, 6, 64, mm_6x64, &pack, NULL, mm_6x64_taps },
-    { "bf16 8x48 avx512", DAR_TILE_BF16, 2, 4, 8, 48, mm_8x48, &pack, NULL, mm_8x48_taps },
-    { "bf16 12x32 avx512", DAR_TILE_BF16, 2, 4, 12, 32, mm_12x32, &pack, NULL, mm_12x32_taps },
-    { "bf16 12x16 avx512", DAR_TILE_BF16, 2, 4, 12, 16, mm_12x16, &pack, NULL, mm_12x16_taps },
+    { "bf16 6x64 avx512", DAR_TILE_BF16, 2, 4, 6, 64, mm_6x64, &pack, NULL, mm_6x64_taps, mm_6x64_rows },
+    { "bf16 8x48 avx512", DAR_TILE_BF16, 2, 4, 8, 48, mm_8x48, &pack, NULL, mm_8x48_taps, mm_8x48_rows },
+    { "bf16 12x32 avx512", DAR_TILE_BF16, 2, 4, 12, 32, mm_12x32, &pack, NULL, mm_12x32_taps, mm_12x32_rows },
+    { "bf16 12x16 avx512", DAR_TILE_BF16, 2, 4, 12, 16, mm_12x16, &pack, NULL, mm_12x16_taps, mm_12x16_rows },
 };
 const dar_tile_set dar_tiles_bf16 = { of, 4 };

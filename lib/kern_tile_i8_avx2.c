@@ -65,5 +65,5 @@ PACK(i8, 1, along, across)
 
 static const dar_packers pack = { .along = { [DAR_I8] = i8_along }, .across = { [DAR_I8] = i8_across } };
 
-static const dar_tile of[] = { { "i8 4x16 avx2", DAR_TILE_I8, 4, 4, 4, 16, mm_4x16, &pack, NULL, NULL } };
+static const dar_tile of[] = { { "i8 4x16 avx2", DAR_TILE_I8, 4, 4, 4, 16, mm_4x16, &pack, NULL, NULL, NULL } };
 const dar_tile_set dar_tiles_i8_avx2 = { of, 1 };

@@ -52,9 +52,9 @@ PACK(i8, 1, along, across)
 static const dar_packers pack = { .along = { [DAR_I8] = i8_along }, .across = { [DAR_I8] = i8_across } };
 
 static const dar_tile of[] = {
-    { "i8 6x64 vnni", DAR_TILE_I8, 4, 4, 6, 64, mm_6x64, &pack, NULL, NULL },
-    { "i8 8x48 vnni", DAR_TILE_I8, 4, 4, 8, 48, mm_8x48, &pack, NULL, NULL },
-    { "i8 12x32 vnni", DAR_TILE_I8, 4, 4, 12, 32, mm_12x32, &pack, NULL, NULL },
-    { "i8 12x16 vnni", DAR_TILE_I8, 4, 4, 12, 16, mm_12x16, &pack, NULL, NULL },
+    { "i8 6x64 vnni", DAR_TILE_I8, 4, 4, 6, 64, mm_6x64, &pack, NULL, NULL, NULL },
+    { "i8 8x48 vnni", DAR_TILE_I8, 4, 4, 8, 48, mm_8x48, &pack, NULL, NULL, NULL },
+    { "i8 12x32 vnni", DAR_TILE_I8, 4, 4, 12, 32, mm_12x32, &pack, NULL, NULL, NULL },
+    { "i8 12x16 vnni", DAR_TILE_I8, 4, 4, 12, 16, mm_12x16, &pack, NULL, NULL, NULL },
 };
 const dar_tile_set dar_tiles_i8_vnni = { of, 4 };

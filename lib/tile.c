@@ -9,42 +9,49 @@
 
 /* ---------------------------------------------------------------- reference tiles */
 
+/* Unit (i, k) of A at rows[i] elements, if there are rows, else i a_row units, and k a_k units. */
 #define DEF_MM(NAME, A, B, C, UNIT)                                                                                    \
-    static inline void NAME##_any(size_t k, size_t taps, const size_t *at, const A *a, size_t a_row, size_t a_k,       \
-                                  const B *b, size_t b_k, C *c, size_t ldc, size_t m, size_t n, dar_put put)           \
+    static inline void NAME##_any(size_t k, size_t taps, const size_t *at, const A *a, const size_t *rows,             \
+                                  size_t a_row, size_t a_k, const B *b, size_t b_k, C *c, size_t ldc, size_t m,        \
+                                  size_t n, dar_put put)                                                               \
     {                                                                                                                  \
         for (size_t i = 0; i < m; i++)                                                                                 \
             for (size_t j = 0; j < n; j++) {                                                                           \
+                const A *row = a + (rows ? rows[i] : i * a_row * UNIT);                                                \
                 C sum = 0;                                                                                             \
                 for (size_t p = 0; p < k; p++)                                                                         \
                     for (size_t s = 0; s < taps; s++)                                                                  \
                         for (size_t u = 0; u < UNIT; u++)                                                              \
-                            sum += (C)a[(i * a_row + (p * taps + s) * a_k) * UNIT + u] *                               \
-                                   (C)b[(p * b_k + at[s] + j) * UNIT + u];                                             \
+                            sum += (C)row[(p * taps + s) * a_k * UNIT + u] * (C)b[(p * b_k + at[s] + j) * UNIT + u];   \
                 c[i * ldc + j] = put == DAR_PUT_ADD ? c[i * ldc + j] + sum : sum;                                      \
             }                                                                                                          \
     }                                                                                                                  \
     static void NAME(size_t k, const void *a, size_t a_row, size_t a_k, const void *b, size_t b_k, void *c,            \
                      size_t ldc, size_t m, size_t n, dar_put put)                                                      \
     {                                                                                                                  \
-        NAME##_any(k, 1, (const size_t[]){ 0 }, a, a_row, a_k, b, b_k, c, ldc, m, n, put);                             \
+        NAME##_any(k, 1, (const size_t[]){ 0 }, a, NULL, a_row, a_k, b, b_k, c, ldc, m, n, put);                       \
     }
-#define DEF_MM_TAPS(NAME)                                                                                              \
+#define DEF_MM_CONV(NAME)                                                                                              \
     static void NAME##_taps(size_t k, size_t taps, const size_t *at, const void *a, size_t a_row, const void *b,       \
                             size_t b_k, void *c, size_t ldc, size_t m, size_t n, dar_put put)                          \
     {                                                                                                                  \
-        NAME##_any(k, taps, at, a, a_row, 1, b, b_k, c, ldc, m, n, put);                                               \
+        NAME##_any(k, taps, at, a, NULL, a_row, 1, b, b_k, c, ldc, m, n, put);                                         \
+    }                                                                                                                  \
+    static void NAME##_rows(size_t k, const void *a, const size_t *rows, const void *b, size_t b_k, void *c,           \
+                            size_t ldc, size_t m, size_t n, dar_put put)                                               \
+    {                                                                                                                  \
+        NAME##_any(k, 1, (const size_t[]){ 0 }, a, rows, 0, 1, b, b_k, c, ldc, m, n, put);                             \
     }
 DEF_MM(mm_f64, double, double, double, 1)
 DEF_MM(mm_f32, float, float, float, 1)
 DEF_MM(mm_i8, uint8_t, int8_t, int32_t, 4)
-DEF_MM_TAPS(mm_f64)
-DEF_MM_TAPS(mm_f32)
+DEF_MM_CONV(mm_f64)
+DEF_MM_CONV(mm_f32)
 
 static const dar_tile ref[] = {
-    { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64, NULL, NULL, mm_f64_taps },
-    { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32, NULL, NULL, mm_f32_taps },
-    { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8, NULL, NULL, NULL },
+    { "f64 4x16 ref", DAR_TILE_F64, 1, 8, 4, 16, mm_f64, NULL, NULL, mm_f64_taps, mm_f64_rows },
+    { "f32 4x16 ref", DAR_TILE_F32, 1, 4, 4, 16, mm_f32, NULL, NULL, mm_f32_taps, mm_f32_rows },
+    { "i8 4x16 ref", DAR_TILE_I8, 4, 4, 4, 16, mm_i8, NULL, NULL, NULL, NULL },
 };
 
 /* ---------------------------------------------------------------- the table */

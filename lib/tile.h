@@ -41,6 +41,9 @@ typedef void dar_mm_fn(size_t k, const void *a, size_t a_row, size_t a_k, const 
 typedef void dar_mm_taps_fn(size_t k, size_t taps, const size_t *at, const void *a, size_t a_row, const void *b,
                             size_t b_k, void *c, size_t ldc, size_t m, size_t n, dar_put put);
 
+typedef void dar_mm_rows_fn(size_t k, const void *a, const size_t *rows, const void *b, size_t b_k, void *c, size_t ldc,
+                            size_t m, size_t n, dar_put put);
+
 typedef struct dar_tile {
     const char *name; /* "f32 6x64 avx512" */
     dar_tile_kind kind;
@@ -67,6 +70,10 @@ typedef struct dar_tile {
      * (i, k taps + s) of A at a + i * a_row + k * taps + s, with B's unit (k, j) at b + k * b_k + at[s] + j; the rest
      * as mm.  NULL for DAR_TILE_I8. */
     dar_mm_taps_fn *mm_taps;
+
+    /* Its gradient by weights: row i of A begins rows[i] elements behind a, whole units or not; the rest as mm.  NULL
+     * for DAR_TILE_I8. */
+    dar_mm_rows_fn *mm_rows;
 } dar_tile;
 
 /* The kind that multiplies operands stored as t fastest here: f64 -> F64; bf16 -> BF16 where the processor has it, else

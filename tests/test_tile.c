@@ -119,29 +119,32 @@ static void fill_operands(const dar_tile *t)
     }
 }
 
-enum way { PACKED, IN_PLACE, TAPS, WAYS };
+enum way { PACKED, IN_PLACE, TAPS, ROWS, WAYS };
 
-/* One product; packed A, or A read where it lies (rows of units + 1), or B read at three places.  Rows of C are aligned
- * if it is streamed. */
+/* One product; packed A, or A read where it lies (rows of units + 1), or B read at three places, or rows of A that
+ * overlap and begin anywhere.  Rows of C are aligned if it is streamed. */
 static void check_mm(const dar_tile *t, size_t m, size_t n, size_t k, enum way way, dar_put put)
 {
-    static const char *const how[] = { "", " add", " stream" }, *const ways[] = { "", " in place", " taps" };
+    static const char *const how[] = { "", " add", " stream" }, *const ways[] = { "", " in place", " taps", " rows" };
     static const size_t places[] = { 5, 0, 3 }, here[] = { 0 };
     size_t taps = way == TAPS ? DAR_COUNT(places) : 1, b_k = way == TAPS ? t->nr + 7 : t->nr;
     size_t units = dar_tile_units(t, k), a_row = way == PACKED ? 1 : units * taps + 1, a_k = way == PACKED ? t->mr : 1;
     size_t ldc = put == DAR_PUT_STREAM ? n / 16 * 16 + 16 : n + 3;
     const size_t *at = way == TAPS ? places : here;
+    size_t begin[MOST];
     double eps = t->kind == DAR_TILE_F64 ? DBL_EPSILON : t->kind == DAR_TILE_I8 ? 0 : FLT_EPSILON;
 
+    for (size_t i = 0; i < m; i++) begin[i] = way == ROWS ? 7 * i % 31 : i * a_row * t->unit;
     memcpy(c, before, sizeof c);
     if (way == TAPS) t->mm_taps(units, taps, at, a, a_row, b, b_k, c, ldc, m, n, put);
+    else if (way == ROWS) t->mm_rows(units, a, begin, b, b_k, c, ldc, m, n, put);
     else t->mm(units, a, a_row, a_k, b, b_k, c, ldc, m, n, put);
     for (size_t i = 0; i < (m + 1) * ldc; i++) {
         size_t row = i / ldc, col = i % ldc;
         bool inside = row < m && col < n;
         double want = inside && put != DAR_PUT_ADD ? 0 : c_at(t, before, i), size = fabs(want);
         for (size_t p = 0; inside && p < units * taps * t->unit; p++) {
-            size_t u = p / t->unit, from = (row * a_row + u * a_k) * t->unit + p % t->unit;
+            size_t u = p / t->unit, from = begin[row] + u * a_k * t->unit + p % t->unit;
             double x = t->kind == DAR_TILE_I8 ? ((uint8_t *)a)[from] : stored(of_kind[t->kind], a, from);
             double y = packed(t, b, b_k, at[u % taps] + col, u / taps * t->unit + p % t->unit);
             want += x * y;
@@ -162,7 +165,7 @@ static void check_products(const dar_tile *t)
         for (size_t j = 0; j < DAR_COUNT(cols); j++)
             for (size_t k = 0; k < DAR_COUNT(depths); k++)
                 for (int v = 0; v < 3 * WAYS; v++)
-                    if (v % WAYS != TAPS || t->mm_taps)
+                    if (v % WAYS < TAPS || t->mm_taps)
                         check_mm(t, rows[i], cols[j], depths[k], v % WAYS, (dar_put)(v / WAYS));
 }
 
