@@ -15,13 +15,14 @@
 #define BAND 16    /* rows of a task */
 #define BEST 1e-10 /* MSE that is as good as none, on the scale 0 .. 1 */
 
-const dar_metric_info dar_metric_table[DAR_METRICS] = {
-    [DAR_METRIC_PSNR] = { "psnr", "PSNR", true },
-    [DAR_METRIC_SSIM] = { "ssim", "SSIM", true },
-    [DAR_METRIC_FLIP] = { "flip", "FLIP", false },
-    [DAR_METRIC_TEMP] = { "templ1", "TempL1", false },
-    [DAR_METRIC_TEMP_TRUTH] = { "templ1_truth", "TempL1 to truth", false },
-    [DAR_METRIC_REF] = { "refl1", "RefL1", false },
+const char *const dar_metric_name[DAR_METRICS] = {
+    [DAR_METRIC_PSNR] = "psnr",
+    [DAR_METRIC_SSIM] = "ssim",
+    [DAR_METRIC_FLIP] = "flip",
+    [DAR_METRIC_TEMP] = "templ1",
+    [DAR_METRIC_TEMP_TRUTH] = "templ1_truth",
+    [DAR_METRIC_REF] = "refl1",
+    [DAR_METRIC_SHARP] = "sharpness",
 };
 
 /* What a band, and then the frame, adds up. */
@@ -29,6 +30,7 @@ typedef struct sums {
     uint64_t pixels[DAR_METRIC_AREAS], windows[DAR_METRIC_AREAS];
     uint64_t whole[DAR_METRIC_AREAS][DAR_METRICS]; /* of integers */
     double real[DAR_METRIC_AREAS][DAR_METRICS];
+    double slope[DAR_METRIC_AREAS]; /* of the truth; that of the result is real[DAR_METRIC_SHARP] */
 } sums;
 
 struct dar_metric {
@@ -109,6 +111,31 @@ static void differences(const dar_metric *m, size_t y, const uint8_t *inside, su
         for (int a = 0; a < DAR_METRIC_AREAS; a++) s->whole[a][k] += got[k][a];
 }
 
+/* ---------------------------------------------------------------- slopes */
+
+/* Of row y, which is not the last, and whose pixels but the last are looked at. */
+static void slopes(const dar_metric *m, size_t y, const uint8_t *picture, const uint8_t *inside,
+                   double sum[DAR_METRIC_AREAS])
+{
+    const size_t n = 3 * m->width;
+    const uint8_t *here = picture + y * n, *below = here + n;
+    for (size_t i = 0; i + 3 < n; i++) {
+        int32_t across = here[i + 3] - here[i], down = below[i] - here[i];
+        double slope = sqrt((double)(across * across + down * down));
+        sum[DAR_METRIC_FRAME] += slope;
+        sum[DAR_METRIC_MASK] += inside[i] ? slope : 0;
+    }
+}
+
+static void sharpness(const dar_metric *m, size_t y, const uint8_t *inside, sums *s)
+{
+    double found[DAR_METRIC_AREAS] = { 0 };
+    if (!wants(m, DAR_METRIC_SHARP) || y + 1 == m->height) return;
+    slopes(m, y, m->found, inside, found);
+    slopes(m, y, m->truth, inside, s->slope);
+    for (int a = 0; a < DAR_METRIC_AREAS; a++) s->real[a][DAR_METRIC_SHARP] += found[a];
+}
+
 /* ---------------------------------------------------------------- bands */
 
 static bool has_windows(const dar_metric *m)
@@ -154,6 +181,7 @@ static void run_band(void *ctx, size_t i, int thread)
         double got[DAR_METRIC_AREAS] = { 0 };
         count(m, y, inside, s);
         differences(m, y, inside, s);
+        sharpness(m, y, inside, s);
         if (has_windows(m) && y >= r && y < m->height - r)
             dar_ssim_row(m->found, m->truth, m->width, y, inside, m->window + (size_t)thread * dar_ssim_work(values),
                          got);
@@ -180,6 +208,7 @@ static sums total(const dar_metric *m)
         for (int a = 0; a < DAR_METRIC_AREAS; a++) {
             t.pixels[a] += m->band[i].pixels[a];
             t.windows[a] += m->band[i].windows[a];
+            t.slope[a] += m->band[i].slope[a];
             for (int k = 0; k < DAR_METRICS; k++) {
                 t.whole[a][k] += m->band[i].whole[a][k];
                 t.real[a][k] += m->band[i].real[a][k];
@@ -199,6 +228,7 @@ static double value(const dar_metric *m, const sums *s, int area, dar_metric_kin
     case DAR_METRIC_SSIM: return s->windows[area] ? s->real[area][k] / (3 * (double)s->windows[area]) : NAN;
     case DAR_METRIC_FLIP: return s->real[area][k] / (double)s->pixels[area];
     case DAR_METRIC_REF: return m->reference ? mean : NAN;
+    case DAR_METRIC_SHARP: return s->slope[area] > 0 ? s->real[area][k] / s->slope[area] : NAN;
     default: return m->begun ? mean : NAN;
     }
 }

@@ -7,12 +7,14 @@
  *   templ1        mean |p[t] - p[t-1]|: how much the result moves, by itself
  *   templ1_truth  mean |(p[t] - p[t-1]) - (g[t] - g[t-1])|: how much it moves otherwise than the truth
  *   refl1         mean |p[t] - reference|
+ *   sharpness     sum |grad p| / sum |grad g|: 1 as sharp as the truth, less where it is blurred, which PSNR forgives.
+ *                 |grad| = hypot of the differences to the right and below, of pixels that have both
  *
  * with p the result, g the truth, L1 distances on the scale 0 .. 255.  The paper's TempL1 may be read either way.
  *
  * Every number also exists restricted to a mask: of the same sums only the pixels where it is 128 or more, for ssim the
  * windows centred there, for templ1 the mask of frame t.  Numbers that do not exist are NAN: templ1 of the first frame,
- * ssim of pictures smaller than the window, anything of no pixel at all.
+ * ssim of pictures smaller than the window, sharpness where the truth is flat, anything of no pixel at all.
  *
  *     dar_metric_begin(m, reference);
  *     for (each frame) {
@@ -38,18 +40,13 @@ typedef enum dar_metric_kind {
     DAR_METRIC_TEMP,
     DAR_METRIC_TEMP_TRUTH,
     DAR_METRIC_REF,
+    DAR_METRIC_SHARP,
     DAR_METRICS
 } dar_metric_kind;
 
 #define DAR_METRIC_ALL ((1u << DAR_METRICS) - 1)
 
-typedef struct dar_metric_info {
-    const char *name;  /* "psnr" */
-    const char *title; /* "PSNR" */
-    bool more_is_better;
-} dar_metric_info;
-
-extern const dar_metric_info dar_metric_table[DAR_METRICS];
+extern const char *const dar_metric_name[DAR_METRICS]; /* "psnr" */
 
 typedef enum dar_metric_area { DAR_METRIC_FRAME, DAR_METRIC_MASK, DAR_METRIC_AREAS } dar_metric_area;
 

@@ -32,10 +32,12 @@ enum {
     DAR_EVAL_MEASURES
 };
 
+typedef enum dar_eval_aim { DAR_EVAL_LESS, DAR_EVAL_MORE, DAR_EVAL_ONE } dar_eval_aim;
+
 typedef struct dar_eval_measure {
     const char *name, *title;
     int digits; /* behind the point */
-    bool more_is_better;
+    dar_eval_aim aim;
 } dar_eval_measure;
 
 extern const dar_eval_measure dar_eval_table[DAR_EVAL_MEASURES];
@@ -171,7 +173,7 @@ dar_eval_sheet *dar_eval_sheet_add(dar_eval_sheets *s, const char *title, size_t
 void dar_eval_sheets_free(dar_eval_sheets *s);
 
 /* Mark best and second of column k among the rows that have a value[row] and are not apart. */
-void dar_eval_sheet_rank(dar_eval_sheet *s, size_t k, const double *value, bool more_is_better);
+void dar_eval_sheet_rank(dar_eval_sheet *s, size_t k, const double *value, dar_eval_aim aim);
 
 void dar_eval_sheet_markdown(const dar_eval_sheet *s, FILE *f);
 

@@ -26,7 +26,8 @@ static void head(dar_eval_sheet *s, size_t column, const char *title, const char
 
 static const char *arrow(int measure)
 {
-    return dar_eval_table[measure].more_is_better ? " ↑" : " ↓";
+    static const char *const text[] = { [DAR_EVAL_LESS] = " ↓", [DAR_EVAL_MORE] = " ↑", [DAR_EVAL_ONE] = " → 1" };
+    return text[dar_eval_table[measure].aim];
 }
 
 static void put_value(dar_eval_entry *x, const dar_interval *i, int measure, bool sign)
@@ -74,7 +75,7 @@ static void put_column(struct paper *p, dar_eval_sheet *s, size_t k, const dar_e
         put_value(at(s, m, k), &i, measure, false);
         p->value[m] = i.mean;
     }
-    dar_eval_sheet_rank(s, k, p->value, dar_eval_table[measure].more_is_better);
+    dar_eval_sheet_rank(s, k, p->value, dar_eval_table[measure].aim);
 }
 
 /* ---------------------------------------------------------------- by method */
@@ -183,7 +184,7 @@ static void trajectory_table(struct paper *p)
         snprintf(count, sizeof count, " (%zu)", clips_in(p, p->v->methods, &w));
         head(s, column, p->v->clip[c].trajectory, count);
         for (size_t m = 0; m < p->v->methods; m++) p->value[m] = put_triple(p, at(s, m, column), m, &w);
-        dar_eval_sheet_rank(s, column++, p->value, true);
+        dar_eval_sheet_rank(s, column++, p->value, DAR_EVAL_MORE);
     }
 }
 
@@ -217,7 +218,7 @@ static void checkpoint_table(struct paper *p)
         p->value[row] = put_triple(p, at(s, row, 3), m, &w);
         row++;
     }
-    dar_eval_sheet_rank(s, 3, p->value, true);
+    dar_eval_sheet_rank(s, 3, p->value, DAR_EVAL_MORE);
 }
 
 /* ---------------------------------------------------------------- pairs */
@@ -249,7 +250,8 @@ static void pair_table(struct paper *p, const char *what, const char *const *the
 {
     const dar_eval *v = p->v;
     const dar_eval_where w = { .set = p->set };
-    const int measure[] = { DAR_METRIC_PSNR, DAR_METRIC_SSIM, DAR_EVAL_ALEX, DAR_METRIC_FLIP, DAR_METRIC_TEMP };
+    const int measure[] = { DAR_METRIC_PSNR, DAR_METRIC_SSIM, DAR_EVAL_ALEX,
+                            DAR_METRIC_FLIP, DAR_METRIC_TEMP, DAR_METRIC_SHARP };
     size_t rows = 0, columns = 4, row = 0;
     for (size_t m = 0; m < v->methods; m++)
         for (size_t k = 0; k < n && is_dar(v, m); k++) rows += partner(v, m, theirs[k]) < v->methods;
@@ -379,7 +381,8 @@ static void separation_table(struct paper *p)
             if (!isnan(v[5])) snprintf(at(s, m, k + 1)->text, sizeof at(s, m, k + 1)->text, "%.2f", v[k]);
         }
     }
-    for (size_t k = 0; k < 6; k++) dar_eval_sheet_rank(s, k + 1, value[k], k == 0 || k == 1 || k == 3);
+    for (size_t k = 0; k < 6; k++)
+        dar_eval_sheet_rank(s, k + 1, value[k], k == 0 || k == 1 || k == 3 ? DAR_EVAL_MORE : DAR_EVAL_LESS);
 }
 
 /* ---------------------------------------------------------------- all of them */

@@ -6,14 +6,15 @@
 #include <string.h>
 
 const dar_eval_measure dar_eval_table[DAR_EVAL_MEASURES] = {
-    [DAR_METRIC_PSNR] = { "psnr", "PSNR", 2, true },
-    [DAR_METRIC_SSIM] = { "ssim", "SSIM", 3, true },
-    [DAR_METRIC_FLIP] = { "flip", "FLIP", 3, false },
-    [DAR_METRIC_TEMP] = { "templ1", "TempL1", 2, false },
-    [DAR_METRIC_TEMP_TRUTH] = { "templ1_truth", "TempL1 to truth", 2, false },
-    [DAR_METRIC_REF] = { "refl1", "RefL1", 2, false },
-    [DAR_EVAL_ALEX] = { "lpips_alex", "LPIPS", 3, false },
-    [DAR_EVAL_VGG] = { "lpips_vgg", "LPIPS (VGG)", 3, false },
+    [DAR_METRIC_PSNR] = { "psnr", "PSNR", 2, DAR_EVAL_MORE },
+    [DAR_METRIC_SSIM] = { "ssim", "SSIM", 3, DAR_EVAL_MORE },
+    [DAR_METRIC_FLIP] = { "flip", "FLIP", 3, DAR_EVAL_LESS },
+    [DAR_METRIC_TEMP] = { "templ1", "TempL1", 2, DAR_EVAL_LESS },
+    [DAR_METRIC_TEMP_TRUTH] = { "templ1_truth", "TempL1 to truth", 2, DAR_EVAL_LESS },
+    [DAR_METRIC_REF] = { "refl1", "RefL1", 2, DAR_EVAL_LESS },
+    [DAR_METRIC_SHARP] = { "sharpness", "Sharpness", 3, DAR_EVAL_ONE },
+    [DAR_EVAL_ALEX] = { "lpips_alex", "LPIPS", 3, DAR_EVAL_LESS },
+    [DAR_EVAL_VGG] = { "lpips_vgg", "LPIPS (VGG)", 3, DAR_EVAL_LESS },
 };
 
 const char *const dar_eval_span_name[DAR_EVAL_SPANS] = { "all", "later", "last" };
@@ -47,14 +48,19 @@ void dar_eval_sheets_free(dar_eval_sheets *s)
     *s = (dar_eval_sheets){ 0 };
 }
 
-void dar_eval_sheet_rank(dar_eval_sheet *s, size_t k, const double *value, bool more_is_better)
+static bool is_better(double a, double b, dar_eval_aim aim)
+{
+    return aim == DAR_EVAL_MORE ? a > b : aim == DAR_EVAL_LESS ? a < b : fabs(a - 1) < fabs(b - 1);
+}
+
+void dar_eval_sheet_rank(dar_eval_sheet *s, size_t k, const double *value, dar_eval_aim aim)
 {
     for (size_t i = 0; i < s->rows; i++) {
         size_t better = 0, ranked = 0;
         for (size_t j = 0; j < s->rows; j++) {
             if (isnan(value[j]) || s->entry[j * s->columns].apart) continue;
             ranked++;
-            better += more_is_better ? value[j] > value[i] : value[j] < value[i];
+            better += is_better(value[j], value[i], aim);
         }
         if (isnan(value[i]) || s->entry[i * s->columns].apart || ranked < 2) continue;
         s->entry[i * s->columns + k].rank = better == 0   ? DAR_EVAL_BEST

@@ -161,7 +161,7 @@ static void print_row(dar_json_writer *w, const char *key, const dar_metric_row 
     dar_json_write_object(w, key);
     for (int a = 0; a < DAR_METRIC_AREAS; a++) {
         dar_json_write_object(w, area[a]);
-        for (int k = 0; k < DAR_METRICS; k++) dar_json_write_number(w, dar_metric_table[k].name, row->v[a][k]);
+        for (int k = 0; k < DAR_METRICS; k++) dar_json_write_number(w, dar_metric_name[k], row->v[a][k]);
         dar_json_write_end(w);
     }
     dar_json_write_end(w);

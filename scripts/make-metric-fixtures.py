@@ -109,6 +109,14 @@ def flip(found, truth):
     return c ** (1 - np.sqrt(f))
 
 
+# ---------------------------------------------------------------- sharpness
+
+
+def slope(x, where):
+    s = np.hypot(np.diff(x, axis=1)[:-1], np.diff(x, axis=0)[:, :-1])
+    return s[where[:-1, :-1]].sum()
+
+
 def main():
     truth = film()
     found = as_bytes(np.roll(truth, 1, 2) + rng.normal(size=truth.shape) * 6)
@@ -129,6 +137,7 @@ def main():
         row = {"psnr": [peak_signal_noise_ratio(a, b, data_range=255) for a, b in ((g, p), (g[m], p[m]))]}
         row["ssim"] = [s[inner].mean(), s[inner & m].mean()]
         row["flip"] = [e.mean(), e[m].mean()]
+        row["sharpness"] = [slope(p, a) / slope(g, a) for a in (np.ones_like(m), m)]
         row["refl1"] = [np.abs(p - truth[0]).mean(), np.abs(p - truth[0])[m].mean()]
         if t:
             d, dg = p - found[t - 1], g - truth[t - 1]

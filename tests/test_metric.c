@@ -42,7 +42,7 @@ static void check_frame(dar_json j, const dar_metric_row *row, int t)
 {
     for (int k = 0; k < DAR_METRICS; k++) {
         double want[2] = { NAN, NAN };
-        const char *name = dar_metric_table[k].name;
+        const char *name = dar_metric_name[k];
         if (!dar_json_get(j, name).item) {
             CHECK(isnan(row->v[0][k]) && isnan(row->v[1][k]), "frame %d has %s", t, name);
             continue;
@@ -148,6 +148,27 @@ static void test_shift(void **state)
     CHECK_NEAR("refl1", r.v[0][DAR_METRIC_REF], 5.0 * (W - 1) / W, 1e-12);
 }
 
+/* A ramp twice as steep, and a flat truth. */
+static void test_sharpness(void **state)
+{
+    (void)state;
+    for (size_t i = 0; i < VALUES; i++) {
+        size_t slope = 3 * (i / 3 % W) + 4 * (i / 3 / W); /* 5 a pixel, 3 across and 4 down */
+        picture[0][i] = (uint8_t)(slope / 2);
+        picture[1][i] = (uint8_t)slope;
+    }
+    memset(mask, 0, sizeof mask);
+    mask[W * H - 1] = 255; /* no pixel to the right of it */
+    dar_metric_row r = once(W, H, picture[1], picture[1], mask);
+    CHECK_NEAR("sharpness of the same", r.v[0][DAR_METRIC_SHARP], 1, 0);
+    CHECK(isnan(r.v[1][DAR_METRIC_SHARP]), "a slope of the last pixel");
+    r = once(W, H, picture[0], picture[1], NULL); /* 1.5 across is 1 or 2 in bytes, in turn */
+    CHECK_NEAR("sharpness of half", r.v[0][DAR_METRIC_SHARP], (sqrt(5) + sqrt(8)) / 2 / 5, 1e-12);
+    memset(picture[1], 9, VALUES);
+    r = once(W, H, picture[0], picture[1], NULL);
+    CHECK(isnan(r.v[0][DAR_METRIC_SHARP]), "sharper than nothing");
+}
+
 static void test_mask_of_one_pixel(void **state)
 {
     size_t at = 12 * W + 30;
@@ -228,9 +249,9 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_fixture), cmocka_unit_test(test_identical),
         cmocka_unit_test(test_offset),  cmocka_unit_test(test_black_and_white),
-        cmocka_unit_test(test_shift),   cmocka_unit_test(test_mask_of_one_pixel),
-        cmocka_unit_test(test_time),    cmocka_unit_test(test_small),
-        cmocka_unit_test(test_threads),
+        cmocka_unit_test(test_shift),   cmocka_unit_test(test_sharpness),
+        cmocka_unit_test(test_time),    cmocka_unit_test(test_mask_of_one_pixel),
+        cmocka_unit_test(test_threads), cmocka_unit_test(test_small),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
