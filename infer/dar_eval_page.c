@@ -10,6 +10,7 @@
 #include "lib/plot.h"
 
 #define MOMENTS 41 /* of the plots over time */
+#define GREY    7  /* in the palette of plots; dashed and dotted ones are rows of reference */
 
 /* ---------------------------------------------------------------- tables */
 
@@ -92,8 +93,7 @@ static void over_time(const dar_eval *v, int measure, struct curves *c)
             y[i] = n > 0 ? sum / n : NAN;
         }
         c->series[m] = (dar_plot_series){ .label = v->method[m].name, .mark = DAR_PLOT_LINE, .n = MOMENTS };
-        c->series[m].faint = v->method[m].kind != DAR_EVAL_GIVEN;
-        c->series[m].colour = (int)m;
+        c->series[m].colour = v->method[m].kind == DAR_EVAL_GIVEN ? (int)m : GREY + 8 * (int)v->method[m].kind;
         c->series[m].x = x;
         c->series[m].y = y;
     }

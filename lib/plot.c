@@ -2,23 +2,27 @@
 #include "lib/plot.h"
 
 #include <math.h>
-#include <stdarg.h>
+#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "lib/file.h"
 
-#define TICKS     64    /* at most on an axis, unlabelled ones included */
-#define CHARACTER 6.4   /* of 12 px text, about [px] */
-#define ROW       18.0  /* of the legend [px] */
-#define RADIUS    3.5   /* of a point [px] */
-#define LARGEST   1e300 /* a value; differences are finite then */
-#define CLOUD     2000  /* points; more are drawn small, without what they say */
+#define TICKS   64    /* at most on an axis, unlabelled ones included */
+#define TEXT    12.0  /* height of letters [px] */
+#define ROW     18.0  /* of the legend [px] */
+#define RADIUS  3.5   /* of a point [px] */
+#define LARGEST 1e300 /* a value; differences are finite then */
+#define CLOUD   2000  /* points; more are drawn small, without what they say */
 
 /* Told apart by people who see colours differently, after Okabe and Ito 2008. */
 static const char *const palette[] = { "#0072b2", "#d55e00", "#009e73", "#b04a8f",
                                        "#e69f00", "#56b4e9", "#8c613c", "#666666" };
+
+/* Of lines, one for each time that the palette repeats. */
+static const char *const dashes[] = { "", " stroke-dasharray=\"7 3\"", " stroke-dasharray=\"2 3\"",
+                                      " stroke-dasharray=\"8 3 2 3\"" };
 
 /* Values of an axis, or their logarithms, from lo to hi, lie from px to px. */
 typedef struct scale {
@@ -47,6 +51,11 @@ static const char *colour(const dar_plot_series *s)
     return palette[(unsigned)s->colour % DAR_COUNT(palette)];
 }
 
+static const char *dash(const dar_plot_series *s)
+{
+    return dashes[(unsigned)s->colour / DAR_COUNT(palette) % DAR_COUNT(dashes)];
+}
+
 /* ---------------------------------------------------------------- text */
 
 static void put_escaped(FILE *f, const char *text)
@@ -58,12 +67,23 @@ static void put_escaped(FILE *f, const char *text)
     }
 }
 
-/* Width of a text [px], about. */
+/* Width of a text [px] in DejaVu Sans, the widest of the fonts that are likely: hundredths of an em from space to
+ * tilde, a whole one for any other character. */
 static double width_of(const char *text)
 {
-    size_t n = 0;
-    for (; *text; text++) n += ((unsigned char)*text & 0xc0) != 0x80;
-    return CHARACTER * (double)n;
+    static const uint8_t advance[95] = {
+        32, 41, 46, 84, 64, 96, 78, 28, 40,  40, 50, 84, 32, 37, 32, 34, 64, 64, 64, 64, 64, 64, 64, 64,
+        64, 64, 34, 34, 84, 84, 84, 54, 100, 69, 69, 70, 78, 64, 58, 78, 76, 30, 30, 66, 56, 87, 75, 79,
+        61, 79, 70, 64, 62, 74, 69, 99, 69,  62, 69, 40, 34, 40, 84, 50, 50, 62, 64, 55, 64, 62, 36, 64,
+        64, 28, 28, 58, 28, 98, 64, 62, 64,  64, 42, 53, 40, 64, 60, 82, 60, 60, 53, 64, 34, 64, 84,
+    };
+    unsigned sum = 0;
+    for (; *text; text++) {
+        unsigned char c = (unsigned char)*text;
+        if (c >= ' ' && c <= '~') sum += advance[c - ' '];
+        else if ((c & 0xc0) == 0xc0) sum += 100; /* the first byte of a character */
+    }
+    return TEXT * sum / 100;
 }
 
 static void put_text(const picture *c, double x, double y, const char *how, const char *text)
@@ -232,8 +252,8 @@ static void put_axis(const picture *c, const scale *s, const ticks *k, bool acro
 static void put_line(const picture *c, const dar_plot_series *s)
 {
     bool pen = false, thin = (double)s->n > 2 * fabs(c->x.to - c->x.from);
-    fprintf(c->f, "<path fill=\"none\" stroke=\"%s\" stroke-width=\"%s\"%s stroke-linejoin=\"round\" d=\"", colour(s),
-            s->faint ? "1" : "2", s->faint ? " stroke-opacity=\".3\"" : "");
+    fprintf(c->f, "<path fill=\"none\" stroke=\"%s\" stroke-width=\"%s\"%s%s stroke-linejoin=\"round\" d=\"", colour(s),
+            s->faint ? "1" : "2", s->faint ? " stroke-opacity=\".3\"" : "", dash(s));
     for (size_t i = 0; i < s->n;) {
         if (!shown(&c->x, s->x[i]) || !shown(&c->y, s->y[i])) {
             pen = false;
@@ -361,8 +381,8 @@ static double put_legend(const picture *c, double left, double right, double top
         if (c->f) {
             const char *pale = s->faint ? " opacity=\".45\"" : "";
             if (s->mark != DAR_PLOT_POINTS)
-                fprintf(c->f, "<path d=\"M%.1f %.1fh22\" stroke=\"%s\" stroke-width=\"2\"%s/>\n", x, y + 9, colour(s),
-                        pale);
+                fprintf(c->f, "<path d=\"M%.1f %.1fh22\" stroke=\"%s\" stroke-width=\"2\"%s%s/>\n", x, y + 9, colour(s),
+                        dash(s), pale);
             if (s->mark != DAR_PLOT_LINE)
                 fprintf(c->f, "<circle cx=\"%.1f\" cy=\"%.1f\" r=\"%g\" fill=\"%s\"%s/>\n", x + 11, y + 9, RADIUS,
                         colour(s), pale);

@@ -20,7 +20,7 @@ typedef enum dar_plot_mark { DAR_PLOT_LINE, DAR_PLOT_POINTS, DAR_PLOT_BOTH } dar
 typedef struct dar_plot_series {
     const char *label; /* in the legend; NULL: not there */
     dar_plot_mark mark;
-    int colour; /* 0, 1, ... of a palette of eight, which repeats */
+    int colour; /* 0, 1, ... of a palette of eight; the next eight are the same with dashed lines, and so on */
     bool faint; /* pale and thin: what others are the mean of; list it before them */
     size_t n;
     const double *x, *y;

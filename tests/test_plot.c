@@ -70,6 +70,38 @@ static void what_it_says(void **state)
     has(&p, (const char *const[]){ ">-1.0<", ">1.0<", NULL });
 }
 
+/* Fourteen methods with wide names: each ends before the next begins, and inside; an M of DejaVu Sans is 10.4 px wide
+ * at 12 px. */
+static void legend(void **state)
+{
+    (void)state;
+    enum { N = 14 };
+    static const double v[] = { 1, 2 };
+    dar_plot_series s[N];
+    char label[N][24];
+    for (int i = 0; i < N; i++) {
+        snprintf(label[i], sizeof label[i], "%d-%.*s", i, 15 - i % 5 * 3, "MMMMMMMMMMMMMMMMMMM");
+        s[i] = (dar_plot_series){ .label = label[i], .colour = i, .n = 2, .x = v, .y = v };
+    }
+    dar_plot p = { .series = s, .n = N };
+    char *svg = text_of(&p);
+    double end = 0, row = 0;
+    for (int i = 0; i < N; i++) {
+        char text[40];
+        double x = NAN, y = NAN;
+        snprintf(text, sizeof text, ">%s</text>", label[i]);
+        const char *at = strstr(svg, text);
+        assert_non_null(at);
+        while (at > svg && *at != '<') at--;
+        assert_int_equal(sscanf(at, "<text x=\"%lf\" y=\"%lf\"", &x, &y), 2);
+        CHECK(y > row || x - 28 >= end, "%s begins at %g, before %g", label[i], x - 28, end);
+        end = x + 10.4 * (15 - i % 5 * 3), row = y;
+        CHECK(end < 720, "%s ends at %g", label[i], end);
+    }
+    CHECK(strstr(svg, "stroke=\"#0072b2\" stroke-width=\"2\" stroke-dasharray"), "the ninth looks like the first");
+    free(svg);
+}
+
 static void hostile(void **state)
 {
     (void)state;
@@ -147,10 +179,8 @@ static void to_a_file(void **state)
 int main(void)
 {
     static const struct CMUnitTest tests[] = {
-        cmocka_unit_test(what_it_says),
-        cmocka_unit_test(hostile),
-        cmocka_unit_test(many_points),
-        cmocka_unit_test(to_a_file),
+        cmocka_unit_test(what_it_says), cmocka_unit_test(legend),    cmocka_unit_test(hostile),
+        cmocka_unit_test(many_points),  cmocka_unit_test(to_a_file),
     };
     return cmocka_run_group_tests_name("plot", tests, scratch_make, scratch_remove) != 0;
 }
