@@ -156,7 +156,8 @@ typedef struct dar_eval_entry {
 } dar_eval_entry;
 
 typedef struct dar_eval_sheet {
-    char title[256], note[512];
+    char title[160], note[512];
+    char set[DAR_EVAL_NAME];         /* of the clips; "": no name */
     size_t rows, columns;            /* column 0 names the row */
     char (*head)[2 * DAR_EVAL_NAME]; /* [columns] */
     dar_eval_entry *entry;           /* [rows, columns] */
@@ -169,7 +170,7 @@ typedef struct dar_eval_sheets {
 } dar_eval_sheets;
 
 /* A sheet with empty entries; NULL: memory ran out. */
-dar_eval_sheet *dar_eval_sheet_add(dar_eval_sheets *s, const char *title, size_t rows, size_t columns);
+dar_eval_sheet *dar_eval_sheet_add(dar_eval_sheets *s, const char *title, const char *set, size_t rows, size_t columns);
 void dar_eval_sheets_free(dar_eval_sheets *s);
 
 /* Mark best and second of column k among the rows that have a value[row] and are not apart. */

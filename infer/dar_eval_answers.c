@@ -156,7 +156,7 @@ static void put_table(struct answers *a, dar_eval_sheets *sheets, const char *ke
     static const char *const head[] = { "First", "Second", "Question", "Of", "Answers", "First preferred", "p" };
     size_t rows = 0, row = 0;
     for (size_t i = 0; i < a->n; i++) rows += is_new(a, i, key);
-    dar_eval_sheet *t = dar_eval_sheet_add(sheets, title, rows, DAR_COUNT(head));
+    dar_eval_sheet *t = dar_eval_sheet_add(sheets, title, "", rows, DAR_COUNT(head));
     if (!t) return;
     for (size_t k = 0; k < DAR_COUNT(head); k++) snprintf(t->head[k], sizeof t->head[k], "%s", head[k]);
     snprintf(t->note, sizeof t->note,

@@ -49,6 +49,8 @@ static const char style[] =
     "header{max-width:1240px;margin:0 auto;padding:3rem 1.5rem 1rem}\n"
     "h1{font-size:2rem;line-height:1.2;letter-spacing:-.02em;margin:0 0 .4rem;font-weight:650}\n"
     "h2{font-size:1.25rem;letter-spacing:-.01em;margin:3rem 0 .3rem;font-weight:620}\n"
+    "h3{font-size:1rem;margin:2rem 0 .3rem;font-weight:600}\n"
+    ".list{display:flex;flex-wrap:wrap;gap:.1rem 1.1rem;max-width:none;font-size:.87rem}\n"
     "p{max-width:78ch;margin:.2rem 0 "
     "1rem}a{color:var(--accent);text-decoration:none}a:hover{text-decoration:underline}\n"
     ".dim,.note,figcaption{color:var(--dim)}.note,figcaption{font-size:.87rem}\n"

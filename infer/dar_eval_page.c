@@ -31,9 +31,9 @@ static void put_note(FILE *f, const char *note)
 
 static void put_sheet(FILE *f, const dar_eval_sheet *s, size_t number)
 {
-    fprintf(f, "<h2 id=\"table-%zu\">", number);
+    fprintf(f, "<h3 id=\"table-%zu\">", number);
     dar_html_text(f, s->title);
-    fputs("</h2>\n", f);
+    fputs("</h3>\n", f);
     if (*s->note) put_note(f, s->note);
     fputs("<div class=\"scroll\"><table>\n<thead><tr>", f);
     for (size_t k = 0; k < s->columns; k++) {
@@ -55,6 +55,34 @@ static void put_sheet(FILE *f, const dar_eval_sheet *s, size_t number)
         fputs("</tr>\n", f);
     }
     fputs("</tbody></table></div>\n", f);
+}
+
+/* Whether a set begins with sheet i. */
+static bool begins(const dar_eval_sheets *s, size_t i)
+{
+    return i == 0 || strcmp(s->at[i].set, s->at[i - 1].set) != 0;
+}
+
+static void put_link(FILE *f, const char *kind, size_t number, const char *text)
+{
+    fprintf(f, "<a href=\"#%s-%zu\">", kind, number);
+    dar_html_text(f, *text ? text : "Tables");
+    fputs("</a>", f);
+}
+
+/* Set by set, each with a list of its tables. */
+static void put_sheets(FILE *f, const dar_eval_sheets *s)
+{
+    for (size_t i = 0; i < s->n; i++) {
+        if (begins(s, i)) {
+            fprintf(f, "<h2 id=\"set-%zu\">", i);
+            dar_html_text(f, *s->at[i].set ? s->at[i].set : "Tables");
+            fputs("</h2>\n<p class=\"list\">", f);
+            for (size_t k = i; k == i || (k < s->n && !begins(s, k)); k++) put_link(f, "table", k, s->at[k].title);
+            fputs("</p>\n", f);
+        }
+        put_sheet(f, &s->at[i], i);
+    }
 }
 
 /* ---------------------------------------------------------------- plots */
@@ -217,13 +245,10 @@ static void put_head(FILE *f, const dar_eval *v, const dar_eval_sheets *s)
     fprintf(f,
             "<header><h1>Evaluation</h1><p class=\"dim\">%zu method%s on %zu clip%s, frame by frame against the true "
             "pictures.  SSIM: Gaussian window of 11, σ 1.5, population covariance, interior.  TempL1, RefL1: 0 to "
-            "255.  Frame 0 is in all means; metrics.json has them without it, too.</p></header>\n<nav><div>",
+            "255.  Methods are given frame 0; tables come with and without it.</p></header>\n<nav><div>",
             given, given == 1 ? "" : "s", v->clips, v->clips == 1 ? "" : "s");
-    for (size_t i = 0; i < s->n; i++) {
-        fprintf(f, "<a href=\"#table-%zu\">", i);
-        dar_html_text(f, s->at[i].title);
-        fputs("</a>", f);
-    }
+    for (size_t i = 0; i < s->n; i++)
+        if (begins(s, i)) put_link(f, "set", i, s->at[i].set);
     fputs("<a href=\"#plots\">Over time</a><a href=\"#clips\">Clips</a></div></nav>\n<main>\n", f);
 }
 
@@ -234,7 +259,7 @@ dar_status dar_eval_page(dar_eval *v, const dar_eval_sheets *sheets, dar_err *e)
     FILE *f = open_memstream(&text, &size);
     if (!f) return dar_fail(e, DAR_ERR_NOMEM, "report.html: out of memory");
     put_head(f, v, sheets);
-    for (size_t i = 0; i < sheets->n; i++) put_sheet(f, &sheets->at[i], i);
+    put_sheets(f, sheets);
     dar_status s = put_plots(f, v, e);
     if (s == DAR_OK) s = put_clips(f, v, e);
     fprintf(f, "</main>\n<script>\n%s%s</script>\n</body>\n</html>\n", dar_html_films, script);

@@ -11,6 +11,7 @@ struct paper {
     dar_eval_sheets *sheets;
     bool has[DAR_EVAL_MEASURES]; /* some clip has it */
     const char *set;             /* of the clips; "": no name */
+    dar_eval_span span;          /* of the frames */
     double *value;               /* [rows] */
 };
 
@@ -61,17 +62,17 @@ static void name_rows(const struct paper *p, dar_eval_sheet *s)
 
 static dar_eval_sheet *begin(struct paper *p, const char *what, size_t rows, size_t columns)
 {
-    char title[256];
-    snprintf(title, sizeof title, "%s%s%s", what, *p->set ? ": " : "", p->set);
-    return dar_eval_sheet_add(p->sheets, title, rows, columns);
+    char title[160];
+    snprintf(title, sizeof title, "%s%s", what, p->span == DAR_EVAL_LATER ? ", without frame 0" : "");
+    return dar_eval_sheet_add(p->sheets, title, p->set, rows, columns);
 }
 
 /* A column of one measure, ranked. */
-static void put_column(struct paper *p, dar_eval_sheet *s, size_t k, const dar_eval_where *w, dar_eval_span span,
-                       dar_metric_area area, int measure)
+static void put_column(struct paper *p, dar_eval_sheet *s, size_t k, const dar_eval_where *w, dar_metric_area area,
+                       int measure)
 {
     for (size_t m = 0; m < p->v->methods; m++) {
-        dar_interval i = dar_eval_interval(p->v, m, p->v->methods, w, span, area, measure);
+        dar_interval i = dar_eval_interval(p->v, m, p->v->methods, w, p->span, area, measure);
         put_value(at(s, m, k), &i, measure, false);
         p->value[m] = i.mean;
     }
@@ -88,11 +89,11 @@ static void main_table(struct paper *p, dar_metric_area area)
     dar_eval_sheet *s =
         begin(p, area == DAR_METRIC_MASK ? "Methods, foreground alone" : "Methods", p->v->methods, columns);
     if (!s) return;
-    snprintf(
-        s->note, sizeof s->note,
-        "%zu clip%s; mean over frames, then over clips.  In brackets: %s  **Best** and _second_ among rows that are "
-        "ranked; † sampled by normalised time or of another protocol, not ranked, as the rows of reference.",
-        n, n == 1 ? "" : "s", n > 1 ? "95 % bootstrap interval over clips." : "nothing, one clip gives no interval.");
+    snprintf(s->note, sizeof s->note,
+             "%zu clip%s; mean over %s, then over clips.  In brackets: %s  **Best** and _second_ among rows that are "
+             "ranked; † sampled by normalised time or of another protocol, not ranked, as the rows of reference.",
+             n, n == 1 ? "" : "s", p->span == DAR_EVAL_LATER ? "frames but the first, which is given" : "frames",
+             n > 1 ? "95 % bootstrap interval over clips." : "nothing, one clip gives no interval.");
     name_rows(p, s);
     head(s, 1, "Clips", "");
     for (size_t m = 0; m < p->v->methods; m++) {
@@ -102,7 +103,7 @@ static void main_table(struct paper *p, dar_metric_area area)
     for (int k = 0, column = 2; k < DAR_EVAL_MEASURES; k++) {
         if (!p->has[k]) continue;
         head(s, (size_t)column, dar_eval_table[k].title, arrow(k));
-        put_column(p, s, (size_t)column++, &w, DAR_EVAL_ALL, area, k);
+        put_column(p, s, (size_t)column++, &w, area, k);
     }
 }
 
@@ -128,7 +129,7 @@ static void difference_table(struct paper *p)
         snprintf(at(s, row, 0)->text, sizeof at(s, row, 0)->text, "%s", v->method[m].name);
         for (int k = 0, column = 2; k < DAR_EVAL_MEASURES; k++) {
             if (!p->has[k]) continue;
-            dar_interval i = dar_eval_interval(p->v, m, v->base, &w, DAR_EVAL_ALL, DAR_METRIC_FRAME, k);
+            dar_interval i = dar_eval_interval(p->v, m, v->base, &w, p->span, DAR_METRIC_FRAME, k);
             head(s, (size_t)column, "Δ ", dar_eval_table[k].title);
             put_value(at(s, row, (size_t)column), &i, k, true);
             if (i.lo > 0 || i.hi < 0) at(s, row, (size_t)column)->rank = DAR_EVAL_BEST;
@@ -148,7 +149,7 @@ static double put_triple(struct paper *p, dar_eval_entry *x, size_t m, const dar
     double v[3];
     const int measure[3] = { DAR_METRIC_PSNR, DAR_METRIC_SSIM, third };
     for (int k = 0; k < 3; k++)
-        v[k] = dar_eval_interval(p->v, m, p->v->methods, w, DAR_EVAL_ALL, DAR_METRIC_FRAME, measure[k]).mean;
+        v[k] = dar_eval_interval(p->v, m, p->v->methods, w, p->span, DAR_METRIC_FRAME, measure[k]).mean;
     if (!isnan(v[0])) snprintf(x->text, sizeof x->text, "%.2f / %.3f / %.3f", v[0], v[1], v[2]);
     return v[0];
 }
@@ -271,14 +272,14 @@ static void pair_table(struct paper *p, const char *what, const char *const *the
             const size_t both[2] = { m, other };
             for (size_t i = 0; i < 2; i++) {
                 dar_interval x =
-                    dar_eval_interval(p->v, both[i], v->methods, &w, DAR_EVAL_ALL, DAR_METRIC_FRAME, DAR_METRIC_PSNR);
+                    dar_eval_interval(p->v, both[i], v->methods, &w, p->span, DAR_METRIC_FRAME, DAR_METRIC_PSNR);
                 snprintf(at(s, row, i)->text, sizeof at(s, row, i)->text, "%s", v->method[both[i]].name);
                 put_value(at(s, row, 2 + i), &x, DAR_METRIC_PSNR, false);
                 at(s, row, 2 + i)->range[0] = 0;
             }
             for (size_t q = 0; q < DAR_COUNT(measure); q++) {
                 if (!p->has[measure[q]]) continue;
-                dar_interval x = dar_eval_interval(p->v, m, other, &w, DAR_EVAL_ALL, DAR_METRIC_FRAME, measure[q]);
+                dar_interval x = dar_eval_interval(p->v, m, other, &w, p->span, DAR_METRIC_FRAME, measure[q]);
                 head(s, column, "Δ ", dar_eval_table[measure[q]].title);
                 put_value(at(s, row, column), &x, measure[q], true);
                 if (x.lo > 0 || x.hi < 0) at(s, row, column)->rank = DAR_EVAL_BEST;
@@ -315,7 +316,7 @@ static void end_table(struct paper *p)
             if (!p->has[measure[k]]) continue;
             head(s, column, dar_eval_table[measure[k]].title,
                  area == DAR_METRIC_MASK ? " foreground" : arrow(measure[k]));
-            put_column(p, s, column++, &w, DAR_EVAL_LAST, (dar_metric_area)area, measure[k]);
+            put_column(p, s, column++, &w, (dar_metric_area)area, measure[k]);
         }
 }
 
@@ -354,6 +355,7 @@ static void separation_table(struct paper *p)
 {
     static const char *const title[] = { "Method",         "PSNR ↑",       "Worst animation ↑", "Its spread ↓",
                                          "Worst camera ↑", "Its spread ↓", "Recombination ↓" };
+    if (strcmp(p->set, "motion-separation") != 0) return;
     dar_eval_sheet *s = begin(p, "Motion and camera apart", p->v->methods, DAR_COUNT(title));
     if (!s) return;
     snprintf(s->note, sizeof s->note,
@@ -370,7 +372,7 @@ static void separation_table(struct paper *p)
             for (size_t j = 0; j < GRID; j++) {
                 const dar_eval_where w = { p->set, NULL, GRID, i, GRID, j };
                 x[i][j] =
-                    dar_eval_interval(p->v, m, p->v->methods, &w, DAR_EVAL_ALL, DAR_METRIC_FRAME, DAR_METRIC_PSNR).mean;
+                    dar_eval_interval(p->v, m, p->v->methods, &w, p->span, DAR_METRIC_FRAME, DAR_METRIC_PSNR).mean;
                 v[0] += x[i][j] / (GRID * GRID);
             }
         v[5] = interaction(x, rows, columns);
@@ -387,21 +389,40 @@ static void separation_table(struct paper *p)
 
 /* ---------------------------------------------------------------- all of them */
 
-static void tables_of_set(struct paper *p)
+static void methods_table(struct paper *p)
+{
+    main_table(p, DAR_METRIC_FRAME);
+}
+
+static void foreground_table(struct paper *p)
+{
+    if (p->v->masked) main_table(p, DAR_METRIC_MASK);
+}
+
+static void swap_table(struct paper *p)
 {
     static const char *const swap[] = { "tracking+normal+depth" };
-    static const char *const masks[] = { "mask+world+normal", "mask+depth+normal" };
-    main_table(p, DAR_METRIC_FRAME);
-    if (p->v->masked) main_table(p, DAR_METRIC_MASK);
-    difference_table(p);
-    trajectory_table(p);
-    checkpoint_table(p);
     pair_table(p, "World position against depth", swap, DAR_COUNT(swap),
                "Tracking and normal stay; world position is replaced by depth.  Ours minus theirs, paired by clip.");
+}
+
+static void mask_table(struct paper *p)
+{
+    static const char *const masks[] = { "mask+world+normal", "mask+depth+normal" };
     pair_table(p, "Tracking against a mask", masks, DAR_COUNT(masks),
                "Persistent identity is replaced by a mask of the foreground.  Ours minus theirs, paired by clip.");
+}
+
+static void tables_of_set(struct paper *p)
+{
+    static void (*const table[])(struct paper *) = {
+        methods_table,    foreground_table, difference_table, trajectory_table,
+        checkpoint_table, swap_table,       mask_table,       separation_table,
+    };
+    for (size_t i = 0; i < DAR_COUNT(table); i++)
+        for (p->span = DAR_EVAL_ALL; p->span <= DAR_EVAL_LATER; p->span++) table[i](p);
+    p->span = DAR_EVAL_LAST;
     end_table(p);
-    if (strcmp(p->set, "motion-separation") == 0) separation_table(p);
 }
 
 void dar_eval_paper(dar_eval *v, dar_eval_sheets *sheets)

@@ -22,7 +22,7 @@ const char *const dar_eval_area_name[DAR_METRIC_AREAS] = { "frame", "mask" };
 
 /* ---------------------------------------------------------------- sheets */
 
-dar_eval_sheet *dar_eval_sheet_add(dar_eval_sheets *s, const char *title, size_t rows, size_t columns)
+dar_eval_sheet *dar_eval_sheet_add(dar_eval_sheets *s, const char *title, const char *set, size_t rows, size_t columns)
 {
     dar_eval_sheet *more = realloc(s->at, (s->n + 1) * sizeof *more);
     if (more) {
@@ -30,6 +30,7 @@ dar_eval_sheet *dar_eval_sheet_add(dar_eval_sheets *s, const char *title, size_t
         dar_eval_sheet *t = &more[s->n++];
         *t = (dar_eval_sheet){ .rows = rows, .columns = columns };
         snprintf(t->title, sizeof t->title, "%s", title);
+        snprintf(t->set, sizeof t->set, "%s", set);
         t->head = calloc(columns, sizeof *t->head);
         t->entry = calloc(rows * columns, sizeof *t->entry);
         if (t->head && t->entry) return t;
@@ -91,7 +92,7 @@ static void put_entry(FILE *f, const dar_eval_entry *x)
 
 void dar_eval_sheet_markdown(const dar_eval_sheet *s, FILE *f)
 {
-    fprintf(f, "## %s\n\n", s->title);
+    fprintf(f, "## %s%s%s\n\n", s->title, *s->set ? ": " : "", s->set);
     if (*s->note) fprintf(f, "%s\n\n", s->note);
     fputc('|', f);
     for (size_t k = 0; k < s->columns; k++) {

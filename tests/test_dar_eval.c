@@ -223,6 +223,31 @@ static void test_refused(void **state)
     assert_false(run_is_there("wrong"));
 }
 
+/* Right in frame 0, which is given, else off by 5. */
+static void first_is_right(uint8_t *rgb, size_t t)
+{
+    if (t) offset(rgb, t);
+}
+
+static void test_without_frame_0(void **state)
+{
+    const double psnr = 20 * log10(51);
+    char all[64], later[64];
+    (void)state;
+    make_method("later", 2, first_is_right, 1);
+    GOOD("later", "same", "--against", "set", "-o", "spans", "--no-report");
+    char *text = text_of("spans/tables.md");
+    char *with = strstr(text, "## Methods: 4d_vis"), *without = strstr(text, "## Methods, without frame 0: 4d_vis");
+    char *pairs = strstr(text, "## Differences from later, without frame 0: 4d_vis");
+    assert_true(with && without && pairs && with < without && without < pairs);
+    snprintf(all, sizeof all, "| later | 2 | _%.2f_ [", (100 + (T - 1) * psnr) / T);
+    snprintf(later, sizeof later, "| later | 2 | _%.2f_ [", psnr);
+    CHECK(strstr(with, all) && strstr(with, all) < without, "no %s in %s", all, with);
+    CHECK(strstr(without, later) && strstr(without, later) < pairs, "no %s in %s", later, without);
+    snprintf(later, sizeof later, "| same | 2 | **%+.2f**", 100 - psnr);
+    CHECK(strstr(pairs, later), "no %s in %s", later, pairs);
+}
+
 static void test_names(void **state)
 {
     (void)state;
@@ -366,10 +391,17 @@ static void test_answers(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(test_known),         cmocka_unit_test(test_time),    cmocka_unit_test(test_size),
-        cmocka_unit_test(test_missing_clips), cmocka_unit_test(test_refused), cmocka_unit_test(test_names),
-        cmocka_unit_test(test_threads),       cmocka_unit_test(test_report),  cmocka_unit_test(test_study),
+        cmocka_unit_test(test_known),
+        cmocka_unit_test(test_time),
+        cmocka_unit_test(test_size),
+        cmocka_unit_test(test_missing_clips),
+        cmocka_unit_test(test_refused),
+        cmocka_unit_test(test_names),
+        cmocka_unit_test(test_threads),
+        cmocka_unit_test(test_report),
+        cmocka_unit_test(test_study),
         cmocka_unit_test(test_answers),
+        cmocka_unit_test(test_without_frame_0),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-eval") || !run_find(bundler, argv[0], "dar-bundle")) return 1;
