@@ -10,12 +10,6 @@
 #define META_BYTES ((size_t)256 << 20) /* address space; pages are taken as they are used */
 #define MAX_KEPT   8                   /* results one segment can keep */
 
-struct dar_spare {
-    struct dar_spare *next;
-    size_t bytes;
-    void *data;
-};
-
 struct kept {
     dar_tensor y, aux;
 };
@@ -33,10 +27,12 @@ struct dar_node {
     const dar_op *op; /* NULL: a segment */
     const void *attr;
     dar_tensor aux;
+    bool own_aux; /* it is the tape's memory */
     dar_segment_fn *fn;
     dar_rows_attr rows; /* of a segment in pieces: fn is NULL */
     void *arg;
     struct dar_keeping *kept; /* [pieces]; NULL: nothing */
+    dar_mark keep, keep_end;  /* where in the keep arena its results lie */
 };
 
 /* ---------------------------------------------------------------- life */
@@ -84,6 +80,35 @@ void *dar_tape_room(dar_tape *t, size_t bytes)
 void *dar_tape_store(dar_tape *t, const void *data, size_t bytes)
 {
     return memcpy(dar_arena_push(&t->meta, bytes), data, bytes);
+}
+
+/* ---------------------------------------------------------------- memory */
+
+static dar_tensor take(dar_tape *t, dar_dtype type, dar_shape s)
+{
+    dar_tensor x = dar_tensor_of(type, s, NULL);
+    x.data = dar_spare_take(&t->spare, t->arena, dar_tensor_bytes(&x));
+    return x;
+}
+
+static void give(dar_tape *t, void *data, size_t bytes)
+{
+    const dar_arena *k = t->keep;
+    dar_spare_give(&t->spare, data, bytes,
+                   k && (unsigned char *)data >= k->base && (unsigned char *)data < k->base + k->size);
+}
+
+static void give_value(dar_tape *t, dar_val *v)
+{
+    if (v->own) give(t, v->x.data, dar_tensor_bytes(&v->x));
+    v->own = false;
+}
+
+void dar_drop(dar_tape *t, dar_val *v)
+{
+    if (!t->inside || !v->own || v->read) return;
+    give_value(t, v);
+    v->x.data = NULL;
 }
 
 static dar_val *push_val(dar_tape *t, dar_tensor x)
@@ -188,6 +213,11 @@ static bool lost(const dar_tape *t, dar_val *const *in, int n)
     return any && t->replaying;
 }
 
+static dar_tensor room_for(dar_tape *t, dar_arena *a, dar_dtype type, dar_shape s)
+{
+    return a == t->arena ? take(t, type, s) : dar_tensor_push(a, type, s);
+}
+
 /* y and, where backward will want it, aux: computed, or known from before. */
 static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool without, const struct how *how)
 {
@@ -210,18 +240,22 @@ static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool wit
     c->y = dar_tensor_of(op->dtype ? op->dtype(type, n, c->attr) : type[0], op->shape(shape, n, c->attr), NULL);
     DAR_ASSERT(!without || !op->aux, "%s: an input has no value in the replay, and backward needs it", op->name);
     if (without) return;
-    c->y = dar_tensor_push(how->y, c->y.dtype, c->y.shape);
-    if (op->aux && how->save) c->aux = dar_tensor_push(how->aux, dar_op_compute(c), op->aux(shape, n, c->attr));
+    c->y = room_for(t, how->y, c->y.dtype, c->y.shape);
+    if (op->aux && how->save) c->aux = room_for(t, how->aux, dar_op_compute(c), op->aux(shape, n, c->attr));
     run(t, op, c, false);
     look(t, op->name, &c->y, false);
 }
 
-static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val *const *in, int n, dar_val *y)
+static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val *const *in, int n, dar_val *y,
+                      bool own_aux)
 {
     dar_node *node = dar_tape_room(t, sizeof *node);
     void *attr = op->attr_size ? dar_tape_store(t, c->attr, op->attr_size) : NULL;
-    *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = attr, .aux = c->aux };
+    *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = attr, .aux = c->aux, .own_aux = own_aux };
     memcpy(node->in, in, (size_t)n * sizeof *in);
+    for (int i = 0; i < n; i++)
+        if (in[i] && op->keep & DAR_KEEP_X(i)) in[i]->read = true;
+    y->read = op->keep & DAR_KEEP_Y;
     t->last = node;
 }
 
@@ -245,7 +279,9 @@ static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n
     compute(t, op, &c, n, lost(t, in, n), &how);
     dar_val *y = push_val(t, c.y);
     y->wants_grad = wants;
-    if (wants) push_node(t, op, &c, in, n, y);
+    y->own = y->x.data && !op->view && !how.ready && how.y == t->arena;
+    if (op->view) in[0]->read = true;
+    if (wants) push_node(t, op, &c, in, n, y, c.aux.data && !how.ready && how.aux == t->arena);
     if (how.made) *how.made = (struct kept){ c.y, c.aux };
     return y;
 }
@@ -257,32 +293,15 @@ dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, con
 
 /* ---------------------------------------------------------------- backward */
 
-static size_t grad_bytes(const dar_val *v)
-{
-    return dar_tensor_count(&v->x) * dar_dtype_size(dar_compute_type(v->x.dtype));
-}
-
 static void ensure_grad(dar_tape *t, dar_val *v)
 {
-    if (v->g.data) return;
-    size_t bytes = grad_bytes(v);
-    void *data = NULL;
-    for (struct dar_spare **p = &t->spare; *p && !data; p = &(*p)->next) {
-        if ((*p)->bytes != bytes) continue;
-        data = (*p)->data;
-        *p = (*p)->next;
-        break;
-    }
-    if (!data) data = dar_arena_push(t->arena, bytes);
-    v->g = dar_tensor_of(dar_compute_type(v->x.dtype), v->x.shape, data);
+    if (!v->g.data) v->g = take(t, dar_compute_type(v->x.dtype), v->x.shape);
 }
 
 static void release_grad(dar_tape *t, dar_val *v)
 {
     if (v->leaf || !v->g.data) return;
-    struct dar_spare *s = dar_tape_room(t, sizeof *s);
-    *s = (struct dar_spare){ t->spare, grad_bytes(v), v->g.data };
-    t->spare = s;
+    give(t, v->g.data, dar_tensor_bytes(&v->g));
     v->g.data = NULL;
     v->has_grad = false;
 }
@@ -349,7 +368,7 @@ static void op_backward(dar_tape *t, const dar_node *node)
     dar_arena_reset(t->arena, m);
 }
 
-static void sweep(dar_tape *t);
+static void sweep(dar_tape *t, const dar_val *from);
 
 /* Where the tape stands before a segment, so that it can stand there again. */
 struct place {
@@ -371,6 +390,7 @@ static void leave(dar_tape *t, const struct place *p)
     t->spare = p->was.spare;
     t->oldest = p->was.oldest;
     t->kept = p->was.kept;
+    t->inside = p->was.inside;
     t->replaying = p->was.replaying;
     t->touched |= p->was.touched;
     dar_arena_reset(t->arena, p->arena);
@@ -398,7 +418,8 @@ static void stand_in(dar_tape *t, const dar_node *node, const bool *had, const d
         if (!node->in[i] || in[i]) continue;
         in[i] = dar_tape_room(t, sizeof *in[i]);
         *in[i] = *node->in[i];
-        in[i]->leaf = true; /* its gradient is not the segment's to free */
+        in[i]->leaf = true; /* its memory is not the segment's to free */
+        in[i]->own = false;
         if (!is_cut(node, i)) continue;
         in[i]->x = dar_rows_view(&in[i]->x, *rows);
         if (in[i]->g.data) in[i]->g = dar_rows_view(&in[i]->g, *rows);
@@ -417,7 +438,7 @@ static void piece_backward(dar_tape *t, const dar_node *node, const bool *had, i
     dar_val *in[DAR_OP_IN] = { 0 };
     struct place p = enter(t);
 
-    t->spare = NULL;
+    t->inside = true;
     t->last = NULL;
     t->oldest = t->meta.base + t->meta.used;
     t->kept = t->keep && node->kept ? &node->kept[i] : NULL;
@@ -427,8 +448,9 @@ static void piece_backward(dar_tape *t, const dar_node *node, const bool *had, i
     dar_val *y = run_piece(t, node, in, &rows);
     if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
     y->g = node->fn ? node->y->g : dar_rows_view(&node->y->g, rows);
+    y->leaf = !node->fn; /* a part of another's gradient is not handed on */
     y->has_grad = true;
-    sweep(t);
+    sweep(t, NULL);
     for (int k = 0; k < node->n; k++)
         if (in[k]) node->in[k]->has_grad = in[k]->has_grad;
     leave(t, &p);
@@ -445,16 +467,33 @@ static void segment_backward(dar_tape *t, const dar_node *node)
     for (int64_t i = 0; i < pieces_of(node); i++) piece_backward(t, node, had, i);
 }
 
-static void sweep(dar_tape *t)
+/* What only this node and what came after it have read is free. */
+static void release(dar_tape *t, dar_node *node, const dar_val *from)
+{
+    if (node->y != from) {
+        give_value(t, node->y);
+        node->y->x.data = NULL;
+    }
+    if (node->own_aux) give(t, node->aux.data, dar_tensor_bytes(&node->aux));
+    if (node->keep_end > node->keep) give(t, t->keep->base + node->keep, node->keep_end - node->keep);
+    release_grad(t, node->y);
+}
+
+/* from: the value that backward began with, whose x stays; or NULL */
+static void sweep(dar_tape *t, const dar_val *from)
 {
     bool recording = t->recording;
     t->recording = true; /* for the replay of segments */
     for (dar_node *node = t->last; node; node = node->prev) {
-        if (!node->y->has_grad) continue;
-        if (!node->op) segment_backward(t, node);
-        else if (node->op->view) view_backward(t, node);
-        else op_backward(t, node);
-        release_grad(t, node->y);
+        if (node->y->has_grad) {
+            bool reads = node->op && node->op->keep & DAR_KEEP_Y;
+            if (!reads && node->y != from) give_value(t, node->y);
+            if (!node->op) segment_backward(t, node);
+            else if (node->op->view) view_backward(t, node);
+            else op_backward(t, node);
+        }
+        release(t, node, from);
+        if (node->y == from && node->op && node->op->view) from = node->in[0]; /* whose memory it is */
     }
     t->last = NULL;
     t->recording = recording;
@@ -470,7 +509,7 @@ void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed)
         else dar_tensor_fill(&y->g, 1);
     }
     y->has_grad = true;
-    sweep(t);
+    sweep(t, y);
 }
 
 /* ---------------------------------------------------------------- segments */
@@ -502,6 +541,7 @@ static void piece_forward(dar_tape *t, const dar_node *node, int64_t i)
     struct place p = enter(t);
     char a[96], b[96];
 
+    t->inside = true;
     t->recording = t->touched = t->replaying = false;
     t->kept = p.was.recording && node->kept ? &node->kept[i] : NULL;
     for (int k = 0; k < node->n; k++) {
@@ -534,16 +574,19 @@ static dar_val *segment(dar_tape *t, const dar_node *like, dar_val *const *in, b
     for (int i = 0; i < node->n; i++) {
         check_origin(t, in[i]);
         node->in[i] = in[i];
+        if (in[i]) in[i]->read = true;
     }
     unread &= t->replaying;
-    node->y =
-        push_val(t, unread ? dar_tensor_of(a->type, a->shape, NULL) : dar_tensor_push(t->arena, a->type, a->shape));
+    node->y = push_val(t, unread ? dar_tensor_of(a->type, a->shape, NULL) : take(t, a->type, a->shape));
+    node->y->own = !unread;
     if (unread) {
         node->y->wants_grad = true;
     } else {
         int64_t pieces = pieces_of(node);
         if (t->keep) node->kept = dar_tape_room(t, (size_t)pieces * sizeof *node->kept);
+        if (t->keep) node->keep = dar_arena_mark(t->keep);
         for (int64_t i = 0; i < pieces; i++) piece_forward(t, node, i);
+        if (t->keep) node->keep_end = dar_arena_mark(t->keep);
     }
     if (node->y->wants_grad) t->last = node;
     return node->y;

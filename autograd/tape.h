@@ -12,20 +12,23 @@
 #include <stdbool.h>
 
 #include "autograd/op.h"
+#include "autograd/spare.h"
 #include "lib/arena.h"
 #include "lib/tensor.h"
 
-/* A value on the tape, valid until dar_tape_clear. */
+/* A value on the tape, valid until dar_tape_clear; but backward gives the memory of what it has passed to gradients:
+ * then x.data is NULL, but for leaves and the value that backward began with. */
 typedef struct dar_val {
     dar_tensor x; /* the value */
     dar_tensor g; /* its gradient, in the arithmetic type; data NULL until backward reaches it */
     bool wants_grad;
     bool has_grad; /* g holds something to add to */
     bool leaf;     /* g is the owner's memory: kept, and added to from step to step */
+    bool own;      /* x is the tape's memory and this value's alone */
+    bool read;     /* backward, or a view, reads x */
 } dar_val;
 
 typedef struct dar_node dar_node;
-struct dar_spare;
 struct dar_keeping;
 
 /* What a step did, or would do. */
@@ -49,11 +52,11 @@ typedef struct dar_tape {
 
     /* Of the tape itself. */
     dar_node *last;           /* newest node */
-    struct dar_spare *spare;  /* gradient buffers that are free again */
+    dar_spare spare;          /* values and gradients that nobody reads any more */
     const void *oldest;       /* first value of the segment being replayed */
     struct dar_keeping *kept; /* of the segment being run or replayed */
-    bool replaying;
-    bool touched; /* an input of an op since the segment began wants a gradient */
+    bool inside, replaying;   /* a segment */
+    bool touched;             /* an input of an op since the segment began wants a gradient */
 } dar_tape;
 
 /* An empty tape over an initialised arena, recording.  Reserves address space for the nodes. */
@@ -62,7 +65,7 @@ dar_status dar_tape_init(dar_tape *t, dar_arena *arena, dar_err *e);
 /* Release the nodes' memory.  Accepts a zeroed tape. */
 void dar_tape_free(dar_tape *t);
 
-/* Forget nodes and values, spare buffers, cost and bad_op.  The arenas `arena` and `keep` are the caller's to reset. */
+/* Forget nodes and values, spare memory, cost and bad_op.  The arenas `arena` and `keep` are the caller's to reset. */
 void dar_tape_clear(dar_tape *t);
 
 /* Where a tape stands, and back there: everything made since is gone.  Nothing of it may be recorded. */
@@ -86,6 +89,9 @@ void *dar_tape_room(dar_tape *t, size_t bytes); /* the same, zeroed */
 /* Run op on n inputs (NULL: absent).  attr is copied.  Inputs that are strided views are copied to contiguous memory
  * first. */
 dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr);
+
+/* Say that v is not used any more: inside a segment its memory is free for others, unless backward will read it. */
+void dar_drop(dar_tape *t, dar_val *v);
 
 /* Gradients of the scalar (or, with seed, of <seed, y>) with respect to every leaf that wants one.  Clears the tape's
  * nodes.  seed: y's shape, arithmetic type; NULL only for one element. */

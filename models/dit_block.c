@@ -79,6 +79,14 @@ static dar_val *rms(dar_tape *t, const struct block *a, const dar_param *w, dar_
     return dar_rms_norm(t, x, dar_param_leaf(t, w), &(dar_norm_opt){ .eps = a->m->c.eps });
 }
 
+/* Rotated; nobody looks at x again. */
+static dar_val *turned(dar_tape *t, dar_val *x, dar_val *rope)
+{
+    dar_val *y = dar_rope(t, x, rope);
+    dar_drop(t, x);
+    return y;
+}
+
 /* The norms before products: from the stream to the products' type. */
 static dar_norm_opt norm_before(const struct block *a)
 {
@@ -101,13 +109,13 @@ static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
 
     modulations(t, a, 0, mod);
     dar_val *h = dar_modulate(t, x, mod[SCALE], mod[SHIFT], &norm), *rope = a->s->rope;
-    dar_val *k = dar_rope(t, rms(t, a, a->b->norm_k[0], product(t, a, DAR_SELF_K, h)), rope);
+    dar_val *k = turned(t, rms(t, a, a->b->norm_k[0], product(t, a, DAR_SELF_K, h)), rope);
     dar_val *v = product(t, a, DAR_SELF_V, h);
     if (a->rest) {
         h = others(t, a, 1, h), x = others(t, a, 1, x), rope = others(t, a, 0, rope);
         mod[GATE] = later(t, mod[GATE]);
     }
-    dar_val *q = dar_rope(t, rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h)), rope);
+    dar_val *q = turned(t, rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h)), rope);
     h = dar_attention(t, q, k, v, &o);
     return gate(t, a, x, last_product(t, a, DAR_SELF_O, h, true), mod[GATE]);
 }
@@ -119,7 +127,10 @@ static dar_val *cross_attention(dar_tape *t, const struct block *a, dar_val *x)
     dar_val *h = dar_layer_norm(t, x, dar_param_leaf(t, a->b->norm3_w), dar_param_leaf(t, a->b->norm3_b), &norm);
     dar_val *q = rms(t, a, a->b->norm_q[1], product(t, a, DAR_CROSS_Q, h));
     h = dar_attention(t, q, a->k, a->v, &o);
-    return dar_add(t, x, last_product(t, a, DAR_CROSS_O, h, false));
+    h = last_product(t, a, DAR_CROSS_O, h, false);
+    x = dar_add(t, x, h);
+    dar_drop(t, h);
+    return x;
 }
 
 static dar_val *feed_forward(dar_tape *t, const struct block *a, dar_val *x)

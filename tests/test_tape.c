@@ -513,6 +513,74 @@ static void segment_edges(void **state)
     }
 }
 
+/* ---------------------------------------------------------------- memory that is free again */
+
+/* Blocks are disjoint, joined where they touch, and what is taken from them lies in them. */
+static void spare_memory(void **state)
+{
+    (void)state;
+    static dar_spare s;
+    unsigned char *p[8];
+    dar_arena_reset(&arena, 0);
+    memset(&s, 0, sizeof s);
+    for (int i = 0; i < 8; i++) p[i] = dar_spare_take(&s, &arena, 1000);
+    size_t used = arena.used;
+    assert_int_equal(used, 8 * 1024);
+    dar_spare_give(&s, p[1], 1000, false);
+    dar_spare_give(&s, p[3], 1000, false);
+    dar_spare_give(&s, p[5], 1000, true); /* as if of another arena */
+    dar_spare_give(&s, p[4], 1000, false);
+    assert_int_equal(s.count, 3);
+    assert_ptr_equal(dar_spare_take(&s, &arena, 2000), p[3]);
+    assert_ptr_equal(dar_spare_take(&s, &arena, 1024), p[1]);
+    dar_spare_give(&s, p[3], 2048, false);
+    dar_spare_give(&s, p[1], 1024, false);
+    dar_spare_give(&s, p[2], 1024, false); /* between the two */
+    assert_int_equal(s.count, 2);
+    assert_ptr_equal(dar_spare_take(&s, &arena, 4096), p[1]);
+    assert_int_equal(arena.used, used);
+    dar_spare_give(&s, p[7], 1000, false);
+    assert_ptr_equal(dar_spare_take(&s, &arena, 3072), p[7]); /* the last block, and more behind it */
+    assert_int_equal(arena.used, used + 2048);
+    dar_spare_give(&s, p[0], 1000, false);
+    dar_spare_give(&s, p[1], 4096, false);
+    assert_ptr_equal(dar_spare_take(&s, &arena, 1024), p[5]);     /* the smallest that is large enough */
+    assert_ptr_equal(dar_spare_take(&s, &arena, 1), p[7] + 3072); /* a large one stays whole */
+    assert_int_equal(s.count, 1);
+}
+
+/* What is dropped is free at once, unless backward reads it. */
+static dar_val *drop(dar_tape *t, void *arg, dar_val *const *in)
+{
+    dar_val *y = dar_silu(t, in[0]), *z = dar_affine(t, y, 2, 0);
+    (void)arg;
+    dar_drop(t, z);
+    dar_val *w = dar_mul(t, y, y);
+    CHECK(!z->x.data && y->x.data && w->x.data, "recording is %d: the wrong values are there", t->recording);
+    dar_drop(t, y);
+    CHECK((y->x.data != NULL) == t->recording, "recording is %d, and what backward reads is %s", t->recording,
+          y->x.data ? "there" : "gone");
+    return w;
+}
+
+static void dropped_values(void **state)
+{
+    double x[4] = { 1, 2, 3, 4 }, g[4] = { 0 }, one[4] = { 1, 1, 1, 1 };
+    dar_tensor tx = dar_tensor_of(DAR_F64, DAR_SHAPE(4), x), tg = dar_tensor_of(DAR_F64, DAR_SHAPE(4), g);
+    (void)state;
+    dar_arena_reset(&arena, 0);
+    dar_tape_clear(&tape);
+    dar_val *v = dar_leaf(&tape, tx, &tg), *y = dar_silu(&tape, v);
+    dar_drop(&tape, y);
+    assert_non_null(y->x.data); /* not in a segment */
+    y = dar_segment(&tape, drop, NULL, &v, 1, DAR_F64, DAR_SHAPE(4));
+    dar_backward(&tape, y, &(dar_tensor){ .dtype = DAR_F64, .shape = tx.shape, .stride = { 1 }, .data = one });
+    for (int i = 0; i < 4; i++) {
+        double s = 1 / (1 + exp(-x[i]));
+        CHECK_NEAR("gradient of silu(x)^2", g[i], 2 * x[i] * s * (s + x[i] * s * (1 - s)), 1e-12);
+    }
+}
+
 /* ---------------------------------------------------------------- wrong calls */
 
 static void wrong_calls_abort(void **state)
@@ -605,7 +673,8 @@ int main(void)
         cmocka_unit_test_setup(gradients_add_up, before),       cmocka_unit_test_setup(frozen_costs_nothing, before),
         cmocka_unit_test_setup(kept_results_save_work, before), cmocka_unit_test_setup(plans_are_exact, before),
         cmocka_unit_test_setup(inference_is_the_same, before),  cmocka_unit_test_setup(steps_do_not_allocate, before),
-        cmocka_unit_test_setup(segment_edges, before),          cmocka_unit_test_setup(wrong_calls_abort, before),
+        cmocka_unit_test_setup(segment_edges, before),          cmocka_unit_test_setup(spare_memory, before),
+        cmocka_unit_test_setup(dropped_values, before),         cmocka_unit_test_setup(wrong_calls_abort, before),
         cmocka_unit_test_setup(bad_numbers_are_named, before),
     };
     return cmocka_run_group_tests(tests, open_arenas, NULL) != 0;
