@@ -26,11 +26,12 @@
 #include "lib/thread.h"
 
 #define MAKING   ".making"
-#define ATTEMPTS 8   /* scenes for one bundle */
-#define MOST     1e7 /* bundles */
-#define COLUMNS  8   /* of the contact sheet */
-#define CELLS    96  /* of the contact sheet, at most */
-#define CELL     224 /* width [px] */
+#define ANY      "any" /* family asked for */
+#define ATTEMPTS 8     /* scenes for one bundle */
+#define MOST     1e7   /* bundles */
+#define COLUMNS  8     /* of the contact sheet */
+#define CELLS    96    /* of the contact sheet, at most */
+#define CELL     224   /* width [px] */
 
 static struct {
     const char *out, *family, *sheet;
@@ -119,6 +120,7 @@ static void say_what(const dar_synth *s, dar_json_writer *w)
 {
     dar_json_write_text(w, "kind", s->thing[0].kind->name);
     dar_json_write_text(w, "family", s->thing[0].kind->family);
+    dar_json_write_text(w, "asked", o.family ? o.family : ANY);
     dar_json_write_text(w, "lights", s->lights);
     dar_json_write_int(w, "things", (int64_t)s->things);
     dar_json_write_int(w, "dropped", (int64_t)s->dropped);
@@ -257,22 +259,29 @@ static dar_status check_found(const struct job *j, size_t index, const char *pat
     char file[PATH_MAX + 16];
     dar_synth_plan p = j->plan;
     dar_json_doc *doc;
+    dar_status s = DAR_OK;
     snprintf(file, sizeof file, "%s/meta.json", path);
     DAR_TRY(dar_json_open(&doc, file, e));
-    dar_json root = dar_json_root(doc), qc = dar_json_object(root, "qc");
+    dar_json root = dar_json_root(doc), qc = dar_json_object(root, "qc"), made = dar_json_object(qc, "made");
     dar_synth_set_plan(j->set, o.common.seed, index, dar_json_size(dar_json_array(qc, "rejected")), o.family, &p);
-    uint64_t seed = (uint64_t)dar_json_int(root, "seed", -1, 0, DAR_BUNDLE_MAX_SEED);
-    int64_t width = dar_json_int(root, "width", 0, 0, INT32_MAX),
-            height = dar_json_int(root, "height", 0, 0, INT32_MAX),
-            frames = dar_json_int(root, "frames", 0, 0, INT32_MAX);
-    double fps = dar_json_number(root, "fps", 0, 0, INFINITY);
-    const char *kind = dar_json_text(dar_json_object(qc, "made"), "kind", "");
-    bool same = seed == p.seed && width == p.width && height == p.height && frames == (int64_t)p.frames &&
-                fps == p.fps && (!p.subject || strcmp(kind, p.subject->name) == 0);
+    const struct {
+        const char *option;
+        bool same;
+    } check[] = {
+        { "--size", dar_json_int(root, "width", 0, 0, INT32_MAX) == p.width &&
+                        dar_json_int(root, "height", 0, 0, INT32_MAX) == p.height },
+        { "--frames", dar_json_int(root, "frames", 0, 0, INT32_MAX) == (int64_t)p.frames },
+        { "--fps", dar_json_number(root, "fps", 0, 0, INFINITY) == p.fps },
+        { "--family", strcmp(dar_json_text(made, "asked", ANY), o.family ? o.family : ANY) == 0 },
+        { "--set or --seed", (uint64_t)dar_json_int(root, "seed", -1, 0, DAR_BUNDLE_MAX_SEED) == p.seed &&
+                                 (!p.subject || strcmp(dar_json_text(made, "kind", ""), p.subject->name) == 0) },
+    };
+    for (size_t i = 0; i < DAR_COUNT(check) && s == DAR_OK; i++)
+        if (!check[i].same)
+            s = dar_fail(e, DAR_ERR_USAGE, "%s: found a bundle made with another %s, expected what this command makes",
+                         path, check[i].option);
     dar_json_close(doc);
-    if (same) return DAR_OK;
-    return dar_fail(e, DAR_ERR_USAGE,
-                    "%s: found a bundle of another set, seed, family or size, expected what this command makes", path);
+    return s;
 }
 
 static dar_status find_missing(struct job *j, dar_err *e)

@@ -21,6 +21,17 @@ static inline int scratch_remove(void **state)
     return run_remove(scratch_dir);
 }
 
+/* The same, and the program works there. */
+static inline int scratch_enter(void **state)
+{
+    return scratch_make(state) == 0 ? chdir(scratch_dir) : -1;
+}
+
+static inline int scratch_leave(void **state)
+{
+    return chdir("/") == 0 ? scratch_remove(state) : -1;
+}
+
 /* NAME in it; the four last answers stay. */
 static inline const char *in_dir(const char *name)
 {

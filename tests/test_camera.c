@@ -1,7 +1,5 @@
 /* test_camera.c: conventions, key poses, camera files, trajectories. */
-#include "tests/test.h"
-
-#include <unistd.h>
+#include "tests/scratch.h"
 
 #include "data/affine.h"
 #include "data/camera.h"
@@ -241,28 +239,6 @@ static void paths(void **state)
 
 /* ---------------------------------------------------------------- files */
 
-static char folder[64];
-
-static const char *temporary(const char *name)
-{
-    static char path[128];
-    snprintf(path, sizeof path, "%s/%s", folder, name);
-    return path;
-}
-
-static int make_folder(void **state)
-{
-    (void)state;
-    snprintf(folder, sizeof folder, "/tmp/camera-XXXXXX");
-    return mkdtemp(folder) == NULL;
-}
-
-static int remove_folder(void **state)
-{
-    (void)state;
-    return rmdir(folder);
-}
-
 static void check_views(const char *what, const dar_camera_path *x, const dar_camera_path *y, double bound, bool near)
 {
     CHECK(x->frames == y->frames, "%s: %zu frames, expected %zu", what, x->frames, y->frames);
@@ -287,7 +263,7 @@ static void round_trips(void **state)
             dar_camera_options o = dar_camera_io_standard();
             dar_camera_path x, y;
             dar_err e = { "" };
-            const char *path = temporary("camera");
+            const char *path = in_dir("camera");
             if (way == 1) o.pose_width = o.pose_height = 0;
             if (way == 2) o.axes = DAR_AXES_BLENDER;
             assert_true(dar_camera_init(&x, 5, NULL) == DAR_OK);
@@ -398,7 +374,7 @@ static void gltf(void **state)
     dar_pose pose;
     dar_arena a;
     dar_err e = { "" };
-    const char *path = temporary("camera.gltf");
+    const char *path = in_dir("camera.gltf");
     double(*world)[12] = calloc(9, sizeof *world);
     assert_true(dar_camera_init(&x, 9, NULL) == DAR_OK);
     for (size_t t = 0; t < 9; t++) {
@@ -671,5 +647,5 @@ int main(void)
         cmocka_unit_test(bad_files),       cmocka_unit_test(archetypes),  cmocka_unit_test(benchmark_paths),
         cmocka_unit_test(animated_bounds), cmocka_unit_test(safety),
     };
-    return cmocka_run_group_tests(tests, make_folder, remove_folder) != 0;
+    return cmocka_run_group_tests(tests, scratch_make, scratch_remove) != 0;
 }

@@ -1,6 +1,6 @@
 /* test_dar_eval.c: the program dar-eval: two small synthetic bundles, methods made of their own pictures, whose answers
  * are known. */
-#include "tests/run.h"
+#include "tests/scratch.h"
 
 #include "data/bundle.h"
 #include "data/png.h"
@@ -13,7 +13,7 @@
 
 enum { VALUES = 3 * W * H };
 
-static char dir[] = "/tmp/dar-eval-XXXXXX", program[PATH_MAX], bundler[PATH_MAX], weights[3][PATH_MAX];
+static char program[PATH_MAX], bundler[PATH_MAX], weights[3][PATH_MAX];
 static const char *const clip[] = { "000000", "000001" };
 
 #define RUN(...) RUN_PROGRAM(program, __VA_ARGS__)
@@ -68,14 +68,13 @@ static void make_method(const char *method, size_t clips, change_fn *change, siz
 
 static int make_all(void **state)
 {
-    (void)state;
     for (int i = 0; i < 3; i++) {
         static const char *const name[] = { "alex", "alex_lin", "vgg" };
         char path[64];
         snprintf(path, sizeof path, "tests/fixtures/lpips_%s.safetensors", name[i]);
         if (!realpath(path, weights[i])) return -1;
     }
-    if (!mkdtemp(dir) || chdir(dir) != 0) return -1;
+    if (scratch_enter(state) != 0) return -1;
     RUN_PROGRAM(bundler, "synth", "--set", "4d_vis", "--count", "2", "--size", "64x48", "--frames", "11", "-o", "set");
     CHECK(ran.status == 0, "%s", ran.err);
     make_method("same", 2, keep, 1);
@@ -83,12 +82,6 @@ static int make_all(void **state)
     make_method("double", 2, keep, 2);
     make_method("half", 1, keep, 1);
     return 0;
-}
-
-static int remove_all(void **state)
-{
-    (void)state;
-    return chdir("/") == 0 ? run_remove(dir) : -1;
 }
 
 /* ---------------------------------------------------------------- results */
@@ -405,5 +398,5 @@ int main(int argc, char **argv)
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-eval") || !run_find(bundler, argv[0], "dar-bundle")) return 1;
-    return cmocka_run_group_tests(tests, make_all, remove_all) != 0;
+    return cmocka_run_group_tests(tests, make_all, scratch_leave) != 0;
 }

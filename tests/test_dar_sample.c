@@ -1,6 +1,6 @@
 /* test_dar_sample.c: the program dar-sample as people and scripts meet it: a small bundle and a small model with random
  * weights in, videos out; what is wrong in one line. */
-#include "tests/run.h"
+#include "tests/scratch.h"
 
 #include <glob.h>
 #include <signal.h>
@@ -26,7 +26,7 @@
 #define T      9
 #define PIXELS ((size_t)W * H)
 
-static char dir[] = "/tmp/dar-sample-XXXXXX", program[PATH_MAX], bundler[PATH_MAX];
+static char program[PATH_MAX], bundler[PATH_MAX];
 
 #define RUN(...) RUN_PROGRAM(program, __VA_ARGS__)
 
@@ -668,17 +668,10 @@ static void refusals(void **state)
 
 static int in_directory(void **state)
 {
-    (void)state;
-    if (!mkdtemp(dir) || chdir(dir) != 0) return 1;
+    if (scratch_enter(state) != 0) return 1;
     write_model("model");
     write_bundles();
     return 0;
-}
-
-static int remove_directory(void **state)
-{
-    (void)state;
-    return chdir("/") != 0 || run_remove(dir) != 0;
 }
 
 int main(int argc, char **argv)
@@ -691,5 +684,5 @@ int main(int argc, char **argv)
         cmocka_unit_test(dry_run), cmocka_unit_test(refusals),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
-    return cmocka_run_group_tests_name("dar-sample", tests, in_directory, remove_directory) != 0;
+    return cmocka_run_group_tests_name("dar-sample", tests, in_directory, scratch_leave) != 0;
 }
