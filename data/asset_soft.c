@@ -177,7 +177,8 @@ static void make_jelly(dar_maker *m, dar_dice *d, const void *row, dar_asset *ou
 
 enum { LINKS = 8 };
 
-/* A tube over links along x or y; each turns against the one before, a wave from end to end. */
+/* A tube over links along y or z; each turns against the one before, a wave from end to end.  Returns the node of the
+ * first link; those of the others follow it. */
 static int make_chain(dar_maker *m, dar_dice *d, int root, const double from[3], const double step[3], double thick,
                       double swing, double phase)
 {
@@ -213,7 +214,31 @@ static int make_chain(dar_maker *m, dar_dice *d, int root, const double from[3],
     int mesh = dar_make_end(m, "chain"), node = dar_make_node(m, root, "chain", 0, 0, 0);
     /* The skin's node has no part in where it is: the joints below the root have. */
     dar_make_skin(m, node, mesh, joint, LINKS);
-    return node;
+    return joint[0];
+}
+
+/* A flat ellipsoid that a link carries; half: its axes. */
+static void add_fin(dar_maker *m, int link, const double at[3], const double half[3], double turn)
+{
+    int node = dar_make_node(m, link, "fin", at[0], at[1], at[2]);
+    dar_make_begin(m);
+    dar_make_rotate(m, 1, 0, 0, turn);
+    dar_make_round(m, half[0], half[1], half[2], 1, 1);
+    dar_make_show(m, node, dar_make_end(m, "fin"));
+}
+
+/* Tail, back and sides of a fish. */
+static void add_fins(dar_maker *m, int first, double thick)
+{
+    const double flat = 0.1 * thick, tail[3] = { flat, 0.4 * thick, 0.9 * thick },
+                 back[3] = { flat, thick, 0.6 * thick };
+    m->paint = dar_asset_paint(m, 0);
+    for (int up = -1; up <= 1; up += 2)
+        add_fin(m, first + LINKS - 1, (const double[]){ 0, 0.45 * up * thick, -0.55 * thick }, tail, 0.8 * up);
+    add_fin(m, first + 3, (const double[]){ 0, 0.75 * thick, 0 }, back, -0.6);
+    for (int side = -1; side <= 1; side += 2)
+        add_fin(m, first + 2, (const double[]){ 1.15 * side * thick, -0.3 * thick, 0 },
+                (const double[]){ 0.7 * thick, flat, 0.4 * thick }, 0.3);
 }
 
 static void make_snake(dar_maker *m, dar_dice *d, const void *row, dar_asset *out)
@@ -221,7 +246,8 @@ static void make_snake(dar_maker *m, dar_dice *d, const void *row, dar_asset *ou
     bool swims = row != NULL;
     double length = dar_dice_in(d, 1.3, 1.9), thick = swims ? 0.17 : dar_dice_in(d, 0.08, 0.13);
     double step[3] = { 0, 0, -length / LINKS }, from[3] = { 0, thick, length / 2 };
-    make_chain(m, d, out->root, from, step, thick, swims ? 0.18 : 0.38, 0);
+    int first = make_chain(m, d, out->root, from, step, thick, swims ? 0.18 : 0.38, 0);
+    if (swims) add_fins(m, first, thick);
     out->way = swims ? DAR_ASSET_FLIES : DAR_ASSET_WALKS;
     out->height = swims ? dar_dice_in(d, 0.4, 0.9) : 0;
     out->speed = dar_dice_in(d, 0.4, 0.8);
