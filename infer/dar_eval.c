@@ -11,6 +11,7 @@
 
 static struct {
     const char *out, *base, *key;
+    dar_eval_codec_files codec;
     dar_arg_list against, lpips, study, answers;
     int align;
     bool masked, no_reference, no_report, overwrite;
@@ -38,10 +39,16 @@ static const dar_option options[] = {
     { .name = "lpips", .placeholder = "FILE...", .type = DAR_ARG_WORDS, .target = &o.lpips,
       .help = "weights of LPIPS: of AlexNet or VGG16 as torchvision has them and of the lpips package, or one file of "
       "both; .pth or .safetensors, in any order" },
+    { .name = "model", .placeholder = "DIR|PRESET", .type = DAR_ARG_TEXT, .target = &o.codec.model,
+      .help = "adds the row 'codec': the truth through the autoencoder of this model, which its renders cannot excel" },
+    { .name = "weights", .placeholder = "DIR", .type = DAR_ARG_TEXT, .target = &o.codec.weights,
+      .help = "where its weights are (default: where the model is)" },
+    { .name = "vae", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.codec.vae,
+      .help = "weights of its autoencoder" },
     { .name = "base", .placeholder = "NAME", .type = DAR_ARG_TEXT, .target = &o.base,
       .help = "the method that others are compared with, clip by clip (default: the first)" },
     { .name = "no-reference", .type = DAR_ARG_FLAG, .target = &o.no_reference,
-      .help = "without the rows 'repeat frame 0' and 'oracle warp'" },
+      .help = "without the rows 'repeat frame 0', 'oracle warp' and 'codec'" },
 
     { .help = "Report" },
     { .name = "no-report", .type = DAR_ARG_FLAG, .target = &o.no_report, .help = "numbers only: no report.html" },
@@ -93,6 +100,15 @@ static dar_status find_base(dar_eval *v, dar_err *e)
                     v->method[0].name);
 }
 
+/* The model of the row 'codec', if all clips fit it. */
+static dar_status open_codec(dar_eval *v, dar_err *e)
+{
+    if (o.study.n || o.no_reference || !o.codec.model) return DAR_OK;
+    DAR_TRY(dar_eval_codec_open(&v->codec, &o.codec, e));
+    for (size_t c = 0; c < v->clips; c++) DAR_TRY(dar_eval_codec_check(v->codec, &v->clip[c], e));
+    return DAR_OK;
+}
+
 /* Pixels that a report of 60 MB has room for: some 0.02 bytes each, errors and base64 with them. */
 static size_t tile_width(const dar_eval *v)
 {
@@ -113,6 +129,7 @@ static dar_status find_all(dar_eval *v, const dar_run *r, dar_err *e)
 {
     if (o.answers.n) return DAR_OK;
     DAR_TRY(dar_eval_find_clips(v, o.against.at, o.against.n, e));
+    DAR_TRY(open_codec(v, e));
     DAR_TRY(dar_eval_find_methods(v, r->program->rest, (size_t)r->program->rests, !o.no_reference, e));
     DAR_TRY(find_base(v, e));
     DAR_TRY(open_weights(v, e));
@@ -154,6 +171,8 @@ static void tell(dar_eval *v, dar_run *r)
     }
     dar_json_write_end(&r->json);
     dar_json_write_text(&r->json, "out", o.out);
+    if (!v->codec && !o.no_reference)
+        dar_log(DAR_LOG_INFO, "no row 'codec', which is the most that renders can reach: it needs --model");
 }
 
 static dar_status check_found(const dar_eval *v, dar_err *e)
@@ -209,6 +228,7 @@ static void free_all(dar_eval *v)
 {
     for (size_t i = 0; v->cell && i < v->methods * v->clips; i++) free(v->cell[i].frame);
     for (size_t i = 0; i < v->files; i++) dar_weights_close(v->weights[i]);
+    dar_eval_codec_close(v->codec);
     free(v->weights);
     dar_sheet_free(&v->sheet);
     free(v->method);

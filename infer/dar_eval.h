@@ -4,6 +4,7 @@
  *   dar_eval_find.c      bundles, methods, where a method's pictures of a clip are
  *   dar_eval_clip.c      one clip: pictures of every method against the truth
  *   dar_eval_warp.c      the oracle: frame 0 carried along the surfaces
+ *   dar_eval_codec.c     the truth through a model's autoencoder
  *   dar_eval_table.c     tables as rows of cells: Markdown
  *   dar_eval_paper.c     which tables there are
  *   dar_eval_file.c      JSON and CSV
@@ -22,6 +23,7 @@
 #include "data/metric.h"
 #include "data/sheet.h"
 #include "lib/stats.h"
+#include "models/encode.h"
 #include "models/lpips.h"
 
 /* ---------------------------------------------------------------- what is measured */
@@ -62,7 +64,13 @@ typedef struct dar_eval_cell {
 /* ---------------------------------------------------------------- methods and clips */
 
 /* Where the pictures come from: somebody's; frame 0 again and again; frame 0 carried along; the autoencoder's. */
-typedef enum dar_eval_kind { DAR_EVAL_GIVEN, DAR_EVAL_REPEAT, DAR_EVAL_WARP, DAR_EVAL_KINDS } dar_eval_kind;
+typedef enum dar_eval_kind {
+    DAR_EVAL_GIVEN,
+    DAR_EVAL_REPEAT,
+    DAR_EVAL_WARP,
+    DAR_EVAL_CODEC,
+    DAR_EVAL_KINDS
+} dar_eval_kind;
 
 #define DAR_EVAL_NAME 64
 
@@ -94,7 +102,8 @@ typedef struct dar_eval {
     size_t clips;
     dar_eval_cell *cell; /* [methods, clips] */
     dar_weights **weights;
-    size_t files; /* of weights */
+    size_t files;                 /* of weights */
+    struct dar_eval_codec *codec; /* NULL: no model is given */
     bool align, masked;
     uint64_t seed;
     double *work;    /* [DAR_BOOTSTRAP] */
@@ -116,7 +125,7 @@ static inline dar_eval_cell *dar_eval_at(const dar_eval *v, size_t method, size_
  * The arrays are the caller's to free, also after a failure. */
 dar_status dar_eval_find_clips(dar_eval *v, const char *const *path, size_t n, dar_err *e);
 
-/* Methods of the command line: [NAME=]PATH, after that the rows of reference. */
+/* Methods of the command line: [NAME=]PATH, after that the rows of reference, of the codec if there is one. */
 dar_status dar_eval_find_methods(dar_eval *v, char *const *word, size_t n, bool reference, dar_err *e);
 
 /* Channels by any of their names, in the order of data/condition.h; *set stays as it is if they are none. */
@@ -144,6 +153,24 @@ void dar_eval_warp_close(dar_eval_warp *w);
 /* rgb [H, W, 3]; lost: covered pixels whose element frame 0 does not show (they take the nearest one's colour), covered
  * pixels.  What nothing covers keeps the colour it has in frame 0. */
 dar_status dar_eval_warp_frame(dar_eval_warp *w, size_t t, uint8_t *rgb, size_t lost[2], dar_err *e);
+
+/* The autoencoder of a model, in bf16 as dar-sample has it: the most that its renders can reach. */
+typedef struct dar_eval_codec dar_eval_codec;
+
+typedef struct dar_eval_codec_files {
+    const char *model, *weights, *vae; /* models/model.h: the model; directory, file of its weights, or NULL */
+} dar_eval_codec_files;
+
+/* On failure *out is NULL. */
+dar_status dar_eval_codec_open(dar_eval_codec **out, const dar_eval_codec_files *files, dar_err *e);
+void dar_eval_codec_close(dar_eval_codec *c); /* accepts NULL */
+
+/* Whether clips of this length and size can be encoded. */
+dar_status dar_eval_codec_check(const dar_eval_codec *c, const dar_eval_clip *clip, dar_err *e);
+
+/* rgb [T, H, W, 3] of the clip there and back; the sink gets the frames. */
+dar_status dar_eval_codec_run(dar_eval_codec *c, const dar_eval_clip *clip, const uint8_t *rgb, dar_decode_sink *sink,
+                              void *ctx, dar_err *e);
 
 /* ---------------------------------------------------------------- tables */
 

@@ -134,6 +134,26 @@ static dar_status run_warp(struct work *w, size_t m, dar_err *e)
     return DAR_OK;
 }
 
+struct showing {
+    struct work *w;
+    size_t m;
+};
+
+static dar_status show_frame(void *ctx, size_t index, const uint8_t *rgb, dar_err *e)
+{
+    const struct showing *s = ctx;
+    (void)e;
+    memcpy(s->w->found, rgb, 3 * s->w->pixels);
+    measure(s->w, s->m, index);
+    return DAR_OK;
+}
+
+static dar_status run_codec(struct work *w, size_t m, dar_err *e)
+{
+    struct showing s = { w, m };
+    return dar_eval_codec_run(w->v->codec, w->clip, w->truth, show_frame, &s, e);
+}
+
 static dar_status run_method(struct work *w, size_t m, dar_err *e)
 {
     dar_eval_method *method = &w->v->method[m];
@@ -145,9 +165,10 @@ static dar_status run_method(struct work *w, size_t m, dar_err *e)
     if (!(cell->frame = calloc(w->frames, sizeof *cell->frame)))
         return dar_fail(e, DAR_ERR_NOMEM, "dar-eval: out of memory");
     dar_metric_begin(w->metric, w->truth);
-    dar_status s = method->kind == DAR_EVAL_REPEAT ? run_repeat(w, m)
-                   : method->kind == DAR_EVAL_WARP ? run_warp(w, m, e)
-                                                   : run_pictures(w, m, path, e);
+    dar_status s = method->kind == DAR_EVAL_REPEAT  ? run_repeat(w, m)
+                   : method->kind == DAR_EVAL_WARP  ? run_warp(w, m, e)
+                   : method->kind == DAR_EVAL_CODEC ? run_codec(w, m, e)
+                                                    : run_pictures(w, m, path, e);
     if (s != DAR_OK) return s;
     finish_cell(w, cell);
     method->clips++;

@@ -217,13 +217,14 @@ dar_status dar_eval_find_methods(dar_eval *v, char *const *word, size_t n, bool 
     static const struct {
         dar_eval_kind kind;
         const char *name;
-    } rows[] = { { DAR_EVAL_REPEAT, "repeat frame 0" }, { DAR_EVAL_WARP, "oracle warp" } };
+    } rows[] = { { DAR_EVAL_REPEAT, "repeat frame 0" }, { DAR_EVAL_WARP, "oracle warp" }, { DAR_EVAL_CODEC, "codec" } };
     v->method = calloc(n + DAR_COUNT(rows), sizeof *v->method);
     v->cell = calloc((n + DAR_COUNT(rows)) * v->clips, sizeof *v->cell);
     v->value = calloc(v->clips, sizeof *v->value);
     if (!v->method || !v->cell || !v->value) return no_memory(e);
     for (size_t i = 0; i < n; i++) DAR_TRY(add_method(v, word[i], e));
     for (size_t i = 0; i < DAR_COUNT(rows) && reference; i++) {
+        if (rows[i].kind == DAR_EVAL_CODEC && !v->codec) continue;
         dar_eval_method *m = &v->method[v->methods++];
         *m = (dar_eval_method){ .kind = rows[i].kind, .path = "", .step = -1, .seed = -1, .external = true };
         copy(m->name, rows[i].name);

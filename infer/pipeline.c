@@ -152,43 +152,22 @@ static dar_status encode(dar_pipeline *p, const uint8_t *rgb, const dar_tensor *
 
 struct picture {
     const dar_pipeline_listener *l;
-    uint8_t *rgb;
+    int64_t frames, group; /* of the latent; frames of one of them */
 };
 
-/* [-1, 1] to display values, rounded to nearest. */
-static dar_status show_frame(void *ctx, const dar_tensor *frame, int64_t index, dar_err *e)
+static dar_status show_frame(void *ctx, size_t index, const uint8_t *rgb, dar_err *e)
 {
-    struct picture *p = ctx;
-    size_t pixels = dar_tensor_count(frame) / 3;
-    for (size_t k = 0; k < 3; k++)
-        for (size_t i = 0; i < pixels; i++) {
-            double x = dar_dtype_get(frame->dtype, frame->data, k * pixels + i);
-            if (!(fabs(x) <= 1)) return dar_fail(e, DAR_ERR_NUMERIC, "frame %lld is not finite", (long long)index);
-            p->rgb[3 * i + k] = (uint8_t)(127.5 * (x + 1) + 0.5);
-        }
-    return p->l->frame(p->l->ctx, (size_t)index, p->rgb, e);
+    const struct picture *p = ctx;
+    const int64_t i = (int64_t)index;
+    DAR_TRY(p->l->frame(p->l->ctx, index, rgb, e));
+    return i % p->group ? DAR_OK : tell(p->l, DAR_PIPELINE_DECODE, i / p->group + 1, p->frames, e);
 }
 
 static dar_status decode(dar_pipeline *p, const dar_tensor *z, const dar_pipeline_listener *l, dar_err *e)
 {
     const dar_vae *v = &p->m->vae;
-    const size_t shrink = (size_t)dar_vae_shrink(&v->c), pixels = (size_t)(p->height * p->width) * shrink * shrink;
-    dar_mark kept = dar_arena_mark(&p->kept);
-    dar_status s = DAR_OK;
-    dar_vae_stream stream;
-    struct picture picture = { l, dar_arena_push(&p->kept, 3 * pixels) };
-    dar_vae_stream_init(&stream, v, DAR_VAE_DECODER, &p->kept);
-    for (int64_t f = 0; f < p->frames && s == DAR_OK; f++) {
-        dar_tape_place begin = dar_tape_mark(&p->tape);
-        dar_tensor from = dar_tensor_narrow(z, 2, f, 1);
-        dar_val *x = dar_input(&p->tape, v->main, from.shape);
-        if (!plans(p)) dar_tensor_copy(&x->x, &from);
-        s = dar_vae_decode_next(&stream, &p->tape, x, plans(p) ? NULL : show_frame, &picture, e);
-        dar_tape_reset(&p->tape, begin);
-        if (s == DAR_OK) s = tell(l, DAR_PIPELINE_DECODE, f + 1, p->frames, e);
-    }
-    dar_arena_reset(&p->kept, kept);
-    return s;
+    struct picture picture = { l, p->frames, dar_vae_shrink_time(&v->c) };
+    return dar_decode_clip(&p->tape, v, &p->kept, z, show_frame, &picture, e);
 }
 
 struct steps {

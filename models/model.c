@@ -165,7 +165,7 @@ static bool needs(const dar_model_options *o, int part)
 static dar_status open_parts(dar_model *m, const dar_model_file *f, const dar_model_options *o, dar_err *e)
 {
     for (int i = 0; i < DAR_MODEL_PARTS; i++) {
-        if ((o->fresh && i != DAR_MODEL_VAE) || (i == DAR_MODEL_TAEW && !o->preview)) continue;
+        if (((o->fresh || o->codec) && i != DAR_MODEL_VAE) || (i == DAR_MODEL_TAEW && !o->preview)) continue;
         find_part(m, f, o, (dar_model_part)i);
         if (*m->path[i]) DAR_TRY(dar_weights_open(&m->open[i], m->path[i], e));
         else if (needs(o, i))
@@ -210,7 +210,7 @@ static dar_status build(dar_model *m, const dar_model_options *o, dar_arena *scr
     dar_params *dit = &m->params[0], *vae = &m->params[1], *taew = &m->params[2];
     for (size_t i = 0; i < DAR_COUNT(m->params); i++) dar_params_init(&m->params[i], &m->weights, o->storage);
     if (o->preview) dar_taew_init(&m->taew, taew, &m->c.taew);
-    dar_dit_init(&m->dit, dit, &m->c.dit, &m->c.adapter);
+    if (!o->codec) dar_dit_init(&m->dit, dit, &m->c.dit, &m->c.adapter);
     dar_vae_init(&m->vae, vae, &m->c.vae);
     if (o->train & DAR_PARAM_LORA) dar_lora_init(&m->dit, dit, &m->c.lora);
     dar_params_train(dit, o->train);

@@ -78,6 +78,7 @@ typedef struct dar_model_options {
     bool random;                       /* weights that have no file are drawn from `seed`: to try speed and memory */
     bool eight;   /* products of the middle blocks are of 8 bits by 8 bits; additions are merged first */
     bool preview; /* the tiny decoder is wanted */
+    bool codec;   /* the autoencoder is all that is wanted */
 
     /* Training: roles that get gradients; additions of config.lora are made if they are among them.  `fresh`: the
      * transformer's values are drawn from `seed`, not read, as are those of new additions always. */

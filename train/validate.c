@@ -13,6 +13,7 @@
 #include "data/sheet.h"
 #include "lib/log.h"
 #include "lib/program.h"
+#include "models/encode.h"
 #include "models/sampler.h"
 
 #define MOMENTS 5   /* columns of a sheet */
@@ -27,7 +28,7 @@ struct dar_validator {
     dar_tape tape;
     size_t bytes[2];
     dar_metric *metric;
-    uint8_t *rgb; /* two pictures */
+    uint8_t *rgb; /* a picture */
     size_t width, height, frames;
 };
 
@@ -46,46 +47,21 @@ static size_t moment(const dar_validator *v, size_t column)
     return column * (v->frames - 1) / (MOMENTS - 1);
 }
 
-static dar_status show_frame(void *ctx, const dar_tensor *frame, int64_t index, dar_err *e)
+static dar_status show_frame(void *ctx, size_t index, const uint8_t *found, dar_err *e)
 {
     struct showing *s = ctx;
     dar_validator *v = s->v;
-    size_t pixels = v->width * v->height;
-    uint8_t *found = v->rgb, *truth = v->rgb + 3 * pixels;
+    uint8_t *truth = v->rgb;
     dar_metric_row row;
-    for (size_t k = 0; k < 3; k++)
-        for (size_t i = 0; i < pixels; i++) {
-            double x = dar_dtype_get(frame->dtype, frame->data, k * pixels + i);
-            if (!(fabs(x) <= 1)) return dar_fail(e, DAR_ERR_NUMERIC, "frame %lld is not finite", (long long)index);
-            found[3 * i + k] = (uint8_t)(127.5 * (x + 1) + 0.5);
-        }
-    DAR_TRY(dar_bundle_rgb(s->b, (size_t)index, truth, e));
+    DAR_TRY(dar_bundle_rgb(s->b, index, truth, e));
     dar_metric_frame(v->metric, found, truth, NULL, &row);
     dar_metric_clip_add(&s->clip, &row);
     for (size_t column = 0; column < MOMENTS; column++)
-        if (moment(v, column) == (size_t)index) {
+        if (moment(v, column) == index) {
             dar_sheet_picture(&s->sheet, 0, column, truth, v->width, v->height, DAR_SHRINK_MEAN);
             dar_sheet_picture(&s->sheet, 1, column, found, v->width, v->height, DAR_SHRINK_MEAN);
         }
     return DAR_OK;
-}
-
-static dar_status decode(dar_validator *v, const dar_tensor *z, struct showing *show, dar_err *e)
-{
-    const dar_vae *vae = &v->m->vae;
-    bool plan = v->kept.plan;
-    dar_status s = DAR_OK;
-    dar_vae_stream stream;
-    dar_vae_stream_init(&stream, vae, DAR_VAE_DECODER, &v->kept);
-    for (int64_t f = 0; f < z->shape.d[2] && s == DAR_OK; f++) {
-        dar_tape_place begin = dar_tape_mark(&v->tape);
-        dar_tensor from = dar_tensor_narrow(z, 2, f, 1);
-        dar_val *x = dar_input(&v->tape, vae->main, from.shape);
-        if (!plan) dar_tensor_copy(&x->x, &from);
-        s = dar_vae_decode_next(&stream, &v->tape, x, plan ? NULL : show_frame, show, e);
-        dar_tape_reset(&v->tape, begin);
-    }
-    return s;
 }
 
 static dar_tensor as_main(dar_validator *v, const dar_tensor *x)
@@ -142,7 +118,7 @@ static dar_status render(dar_validator *v, const dar_batch *b, struct showing *s
                                    NULL, NULL, e);
     dar_sampler_free(&sampler);
     if (s == DAR_OK && !v->kept.plan) *latent = distance(&z, &z0);
-    return s == DAR_OK ? decode(v, &z, show, e) : s;
+    return s == DAR_OK ? dar_decode_clip(&v->tape, &v->m->vae, &v->kept, &z, show_frame, show, e) : s;
 }
 
 /* ---------------------------------------------------------------- sheets and numbers */
@@ -310,7 +286,7 @@ static dar_status reserve(dar_validator *v, dar_err *e)
     DAR_TRY(dar_arena_init(&v->kept, "validation", v->bytes[0], e));
     DAR_TRY(dar_arena_init(&v->step, "validation step", v->bytes[1], e));
     DAR_TRY(dar_tape_init(&v->tape, &v->step, e));
-    if (!(v->rgb = malloc(6 * v->width * v->height)))
+    if (!(v->rgb = malloc(3 * v->width * v->height)))
         return dar_fail(e, DAR_ERR_NOMEM, "validation: out of memory for two pictures");
     return dar_metric_open(&v->metric, v->width, v->height, 1u << DAR_METRIC_PSNR | 1u << DAR_METRIC_SSIM, e);
 }
