@@ -5,6 +5,7 @@
  *   dar_eval_clip.c      one clip: pictures of every method against the truth
  *   dar_eval_warp.c      the oracle: frame 0 carried along the surfaces
  *   dar_eval_codec.c     the truth through a model's autoencoder
+ *   dar_eval_variant.c   one scene with many references: shape and appearance
  *   dar_eval_table.c     tables as rows of cells: Markdown
  *   dar_eval_paper.c     which tables there are
  *   dar_eval_file.c      JSON and CSV
@@ -54,11 +55,24 @@ typedef struct dar_eval_row {
     double v[DAR_METRIC_AREAS][DAR_EVAL_MEASURES]; /* NAN: there is none */
 } dar_eval_row;
 
+/* Of renders of one scene with many references (dar_eval_variant.c). */
+typedef enum dar_eval_variant_number {
+    DAR_EVAL_VARIANT_IOU,     /* of what is seen of the objects with their geometry */
+    DAR_EVAL_VARIANT_OWN,     /* distance from the truth of its own reference, 0 .. 255 */
+    DAR_EVAL_VARIANT_OTHER,   /* from the nearest of the others' */
+    DAR_EVAL_VARIANT_MARGIN,  /* other - own */
+    DAR_EVAL_VARIANT_NEAREST, /* 1: its own is the nearest; 0 */
+    DAR_EVAL_VARIANTS
+} dar_eval_variant_number;
+
+extern const char *const dar_eval_variant_name[DAR_EVAL_VARIANTS];
+
 /* A method on a clip. */
 typedef struct dar_eval_cell {
     bool there, aligned; /* aligned: of other length or size, sampled by normalised time, resized */
     dar_eval_row span[DAR_EVAL_SPANS];
     dar_eval_row *frame; /* [frames] */
+    double variant[DAR_EVAL_VARIANTS];
 } dar_eval_cell;
 
 /* ---------------------------------------------------------------- methods and clips */
@@ -91,8 +105,8 @@ typedef struct dar_eval_clip {
     size_t frames, width, height;
     double fps;
     bool masks;
-    double
-        lost[2]; /* share of what is covered that frame 0 does not show: mean over frames, last frame; NAN: unknown */
+    double lost[2]; /* share of what frame 0 does not show of surfaces: mean over frames, last frame; NAN: unknown */
+    double seen;    /* of reference variants, IoU of the truth's objects, as seen, with their geometry; NAN: unknown */
 } dar_eval_clip;
 
 typedef struct dar_eval {
@@ -171,6 +185,23 @@ dar_status dar_eval_codec_check(const dar_eval_codec *c, const dar_eval_clip *cl
 /* rgb [T, H, W, 3] of the clip there and back; the sink gets the frames. */
 dar_status dar_eval_codec_run(dar_eval_codec *c, const dar_eval_clip *clip, const uint8_t *rgb, dar_decode_sink *sink,
                               void *ctx, dar_err *e);
+
+/* ---------------------------------------------------------------- reference variants */
+
+typedef struct dar_eval_variant dar_eval_variant;
+
+/* For clip c and its truth [T, H, W, 3]; *out is NULL if its set is not refvar, or its clips differ in geometry, which
+ * is told, and on failure. */
+dar_status dar_eval_variant_open(dar_eval_variant **out, dar_eval *v, size_t c, dar_bundle *b, const uint8_t *truth,
+                                 dar_err *e);
+void dar_eval_variant_close(dar_eval_variant *x); /* accepts NULL */
+
+/* Frames of a method in order, then its numbers, NAN where there are none. */
+void dar_eval_variant_frame(dar_eval_variant *x, size_t t, const uint8_t *found);
+void dar_eval_variant_end(dar_eval_variant *x, double row[DAR_EVAL_VARIANTS]);
+
+/* Mean and interval of a method over the clips of a set. */
+dar_interval dar_eval_variant_interval(dar_eval *v, size_t m, const char *set, dar_eval_variant_number k);
 
 /* ---------------------------------------------------------------- tables */
 

@@ -19,7 +19,8 @@ struct work {
     dar_metric *metric;
     dar_lpips *lpips[DAR_LPIPS_NETS];
     dar_eval_warp *warp;
-    dar_eval_film *film; /* NULL: none is wanted */
+    dar_eval_variant *variant; /* NULL: the clip is none */
+    dar_eval_film *film;       /* NULL: none is wanted */
 };
 
 /* ---------------------------------------------------------------- means */
@@ -55,6 +56,8 @@ static void finish_cell(const struct work *w, dar_eval_cell *cell)
     mean(&all, &cell->span[DAR_EVAL_ALL]);
     mean(&later, &cell->span[DAR_EVAL_LATER]);
     cell->span[DAR_EVAL_LAST] = cell->frame[w->frames - 1];
+    for (int k = 0; k < DAR_EVAL_VARIANTS; k++) cell->variant[k] = NAN;
+    if (w->variant) dar_eval_variant_end(w->variant, cell->variant);
     cell->there = true;
 }
 
@@ -73,6 +76,7 @@ static void measure(struct work *w, size_t m, size_t t)
         if (w->lpips[net]) dar_lpips_distance(w->lpips[net], w->found, truth, mask, d);
         for (int a = 0; a < DAR_METRIC_AREAS; a++) row->v[a][DAR_EVAL_ALEX + net] = d[a];
     }
+    if (w->variant) dar_eval_variant_frame(w->variant, t, w->found);
     if (w->film) dar_eval_film_add(w->film, 1 + m, t, w->found, dar_metric_map(w->metric));
     dar_eval_sheet_show(w->v, w->c, m, t, w->found);
 }
@@ -206,6 +210,7 @@ static dar_status open_all(struct work *w, dar_err *e)
     DAR_TRY(dar_bundle_open(&w->b, c->path, e));
     if (v->tile) DAR_TRY(dar_eval_film_open(&w->film, v->methods + 1, c, v->tile, e));
     DAR_TRY(load_truth(w, e));
+    DAR_TRY(dar_eval_variant_open(&w->variant, w->v, w->c, w->b, w->truth, e));
     DAR_TRY(dar_metric_open(&w->metric, c->width, c->height, DAR_METRIC_ALL, e));
     for (int k = 0; k < DAR_LPIPS_NETS; k++)
         if (dar_lpips_there((dar_lpips_net)k, v->weights, v->files))
@@ -217,6 +222,7 @@ static void close_all(struct work *w)
 {
     dar_eval_film_close(w->film);
     dar_eval_warp_close(w->warp);
+    dar_eval_variant_close(w->variant);
     dar_metric_close(w->metric);
     for (int k = 0; k < DAR_LPIPS_NETS; k++) dar_lpips_close(w->lpips[k]);
     dar_bundle_close(w->b);

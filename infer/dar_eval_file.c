@@ -59,6 +59,17 @@ static void print_intervals(dar_json_writer *w, dar_eval *v, size_t m, size_t ba
     }
 }
 
+static void print_variants(dar_json_writer *w, dar_eval *v, size_t m, const char *set)
+{
+    if (!dar_eval_variant_interval(v, m, set, DAR_EVAL_VARIANT_IOU).n) return;
+    dar_json_write_object(w, "variants");
+    for (int k = 0; k < DAR_EVAL_VARIANTS; k++) {
+        dar_interval i = dar_eval_variant_interval(v, m, set, (dar_eval_variant_number)k);
+        print_interval(w, dar_eval_variant_name[k], &i);
+    }
+    dar_json_write_end(w);
+}
+
 /* Whether clip c is the first of its set, or of its set and path. */
 static bool is_first(const dar_eval *v, size_t c, bool path)
 {
@@ -86,6 +97,7 @@ static void print_method(dar_json_writer *w, dar_eval *v, size_t m)
         if (!is_first(v, c, false)) continue;
         dar_json_write_object(w, v->clip[c].set);
         print_intervals(w, v, m, v->methods, &where);
+        print_variants(w, v, m, where.set);
         if (m != v->base) {
             dar_json_write_object(w, "minus_base");
             print_intervals(w, v, m, v->base, &where);
@@ -110,6 +122,7 @@ static void print_clip(dar_json_writer *w, const dar_eval *v, size_t c)
     dar_json_write_int(w, "height", (int64_t)x->height);
     if (!isnan(x->lost[0])) dar_json_write_number(w, "not_in_frame_0", x->lost[0]);
     if (!isnan(x->lost[1])) dar_json_write_number(w, "not_in_frame_0_at_the_end", x->lost[1]);
+    if (!isnan(x->seen)) dar_json_write_number(w, "iou_of_truth", x->seen);
     dar_json_write_object(w, "aligned");
     for (size_t m = 0; m < v->methods; m++)
         if (v->cell[m * v->clips + c].aligned) dar_json_write_bool(w, v->method[m].name, true);

@@ -52,7 +52,7 @@ static dar_status add_clip(dar_eval *v, const char *path, const char *name, cons
     if (!more) return no_memory(e);
     v->clip = more;
     dar_eval_clip *c = &more[v->clips];
-    *c = (dar_eval_clip){ .number = v->clips, .lost = { NAN, NAN } };
+    *c = (dar_eval_clip){ .number = v->clips, .lost = { NAN, NAN }, .seen = NAN };
     snprintf(c->path, sizeof c->path, "%s", path);
     copy(c->name, name);
     copy(c->set, set);

@@ -309,6 +309,100 @@ static void test_codec(void **state)
     assert_false(run_is_there("wrong"));
 }
 
+/* ---------------------------------------------------------------- reference variants */
+
+static void negative(uint8_t *rgb, size_t t)
+{
+    (void)t;
+    for (size_t i = 0; i < VALUES; i++) rgb[i] = (uint8_t)(255 - rgb[i]);
+}
+
+static void empty(uint8_t *rgb, size_t t)
+{
+    (void)t;
+    memset(rgb, 90, VALUES);
+}
+
+enum { LOOKS = 3, LOOK_FRAMES = 5 };
+
+/* Of each of refvar's clips the truth of the one that is `shift` further, changed. */
+static void make_looks(const char *method, size_t shift, change_fn *change)
+{
+    static uint8_t rgb[VALUES];
+    mkdir(method, 0777);
+    for (size_t c = 0; c < LOOKS; c++) {
+        char path[64];
+        dar_bundle *b;
+        dar_err e;
+        snprintf(path, sizeof path, "looks/%06zu", (c + shift) % LOOKS);
+        CHECK(dar_bundle_open(&b, path, &e) == DAR_OK, "%s", e.text);
+        snprintf(path, sizeof path, "%s/%06zu", method, c);
+        mkdir(path, 0777);
+        for (size_t t = 0; t < LOOK_FRAMES; t++) {
+            CHECK(dar_bundle_rgb(b, t, rgb, &e) == DAR_OK, "%s", e.text);
+            change(rgb, t);
+            snprintf(path, sizeof path, "%s/%06zu/%zu.png", method, c, t);
+            CHECK(dar_png_write(path, W, H, 3, rgb, &e) == DAR_OK, "%s", e.text);
+        }
+        dar_bundle_close(b);
+    }
+}
+
+static double variant_of(const char *method, const char *number)
+{
+    dar_json j = dar_json_get(dar_json_get(method_of(method), "sets"), "refvar");
+    return dar_json_number(dar_json_get(dar_json_get(j, "variants"), number), "mean", NAN, -1e9, 1e9);
+}
+
+/* What has the truth's shape in other colours is seen as well as the truth; what shows nothing is not; what shows
+ * another's appearance is next to that one. */
+static void test_variants(void **state)
+{
+    double truth = 0;
+    (void)state;
+    RUN_PROGRAM(bundler, "synth", "--set", "refvar", "--count", "3", "--size", "64x48", "--frames", "5", "-o", "looks");
+    CHECK(ran.status == 0, "%s", ran.err);
+    make_looks("own", 0, keep);
+    make_looks("negative", 0, negative);
+    make_looks("empty", 0, empty);
+    make_looks("swapped", 1, keep);
+    GOOD("own", "negative", "empty", "swapped", "--against", "looks", "-o", "variants", "--no-report");
+    open_results("variants");
+    for (dar_json j = dar_json_first(dar_json_get(dar_json_root(doc), "clips")); j.item; j = dar_json_next(j))
+        truth += dar_json_number(j, "iou_of_truth", NAN, 0, 1) / LOOKS;
+    CHECK(truth > 0.5, "IoU of the truth: %g", truth);
+    CHECK_NEAR("IoU of its own", variant_of("own", "iou"), truth, 1e-12);
+    CHECK_NEAR("IoU of its negative", variant_of("negative", "iou"), truth, 0.02); /* the map is held a little */
+    CHECK_NEAR("IoU of nothing", variant_of("empty", "iou"), 0, 0.02);
+    CHECK_NEAR("own to own", variant_of("own", "own"), 0, 0);
+    CHECK(variant_of("own", "margin") > 1, "all look the same");
+    CHECK_NEAR("own is nearest", variant_of("own", "nearest_own"), 1, 0);
+    CHECK_NEAR("swapped to another", variant_of("swapped", "other"), 0, 0);
+    CHECK_NEAR("swapped to own", variant_of("swapped", "own"), -variant_of("swapped", "margin"), 1e-12);
+    CHECK_NEAR("swapped is nearest to own", variant_of("swapped", "nearest_own"), 0, 0);
+    dar_json_close(doc);
+    char *text = text_of("variants/tables.md");
+    CHECK(strstr(text, "## Shape stays, appearance follows: refvar"), "%s", text);
+    CHECK(!strstr(text_of("known/tables.md"), "Shape stays"), "variants of 4d_vis");
+}
+
+/* Two camera paths are two geometries. */
+static void test_no_variants(void **state)
+{
+    (void)state;
+    mkdir("other", 0777);
+    mkdir("other/refvar", 0777);
+    for (int i = 0; i < 2; i++) {
+        char from[32], to[32];
+        snprintf(from, sizeof from, "../../set/%s", clip[i]);
+        snprintf(to, sizeof to, "other/refvar/%s", clip[i]);
+        assert_int_equal(symlink(from, to), 0);
+    }
+    GOOD("same", "--against", "other/refvar", "-o", "other-out", "--no-report");
+    CHECK(strstr(ran.err, "its geometry is not that of"), "%s", ran.err);
+    CHECK(!strstr(text_of("other-out/tables.md"), "Shape stays"), "variants of two geometries");
+}
+
 static void test_names(void **state)
 {
     (void)state;
@@ -464,6 +558,8 @@ int main(int argc, char **argv)
         cmocka_unit_test(test_answers),
         cmocka_unit_test(test_without_frame_0),
         cmocka_unit_test(test_codec),
+        cmocka_unit_test(test_variants),
+        cmocka_unit_test(test_no_variants),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-eval") || !run_find(bundler, argv[0], "dar-bundle")) return 1;
