@@ -409,12 +409,15 @@ static int asked_to_stop(const char *number)
     return dar_program_main(&program, 1, argv);
 }
 
-/* The program starts again once, with its words, and finds the environment set; it leaves alone what is set. */
+/* The program starts again once, with its words, and finds the environment set; where one of these says how threads
+ * run, it does not. */
+static const char *const said[] = { "OMP_WAIT_POLICY", "OMP_PROC_BIND", "OMP_PLACES" };
+
 static int restarted(char **argv)
 {
-    if (strcmp(argv[1], "set") == 0) setenv("OMP_WAIT_POLICY", "active", 1);
-    else if (getenv("GOMP_SPINCOUNT")) return 7;
-    else unsetenv("OMP_WAIT_POLICY");
+    if (getenv("GOMP_SPINCOUNT")) return 7;
+    for (size_t i = 0; i < DAR_COUNT(said); i++) unsetenv(said[i]);
+    if (strcmp(argv[1], "none") != 0) setenv(argv[1], "true", 1);
     dar_threads_restart(argv);
     return getenv("GOMP_SPINCOUNT") ? 1 : 8;
 }
@@ -424,20 +427,16 @@ static char *self;
 static void restart(void **state)
 {
     (void)state;
-    static const struct {
-        const char *word;
-        int status;
-    } cases[] = { { "restart", 7 }, { "set", 8 } };
-    for (size_t i = 0; i < DAR_COUNT(cases); i++) {
+    for (size_t i = 0; i <= DAR_COUNT(said); i++) {
         char word[16];
-        snprintf(word, sizeof word, "%s", cases[i].word);
+        snprintf(word, sizeof word, "%s", i ? said[i - 1] : "none");
         char *argv[] = { self, word, "again", NULL };
         pid_t pid;
         int how;
         unsetenv("GOMP_SPINCOUNT");
         assert_int_equal(posix_spawn(&pid, self, NULL, NULL, argv, environ), 0);
         assert_int_equal(waitpid(pid, &how, 0), pid);
-        CHECK(WIFEXITED(how) && WEXITSTATUS(how) == cases[i].status, "%s: ended as %d", word, how);
+        CHECK(WIFEXITED(how) && WEXITSTATUS(how) == (i ? 8 : 7), "%s: ended as %d", word, how);
     }
 }
 
