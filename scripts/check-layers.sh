@@ -37,7 +37,7 @@ BEGIN {
 
     standard = "^(complex|ctype|errno|fenv|float|inttypes|limits|locale|math|setjmp|signal|stdalign|stdarg|" \
         "stdatomic|stdbool|stddef|stdint|stdio|stdlib|string|time|wchar|" \
-        "dirent|fcntl|ftw|glob|pthread|sched|spawn|strings|unistd|sys/[a-z]+)[.]h$"
+        "dirent|fcntl|fnmatch|ftw|glob|pthread|sched|spawn|strings|unistd|sys/[a-z]+)[.]h$"
 }
 
 FNR == 1 {

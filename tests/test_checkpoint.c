@@ -23,11 +23,13 @@ typedef struct run {
     dar_checkpoint c;
 } run;
 
-/* dar-test with trained parameters of these roles; everything, moments too, random from seed. */
+/* dar-test with trained parameters of these roles; everything, moments too, random from seed.  With moments in bf16
+ * weights are averaged. */
 static void run_init(run *r, const char *where, unsigned roles, dar_dtype storage, bool bf16_moments, uint64_t seed)
 {
     dar_optim_config o = dar_optim_default();
     o.bf16_moments = bf16_moments;
+    o.average = bf16_moments ? 0.9 : 0;
     model_init(&r->net, &config, storage, false);
     dar_lora_init(&r->net.m, &r->net.p, &config.lora);
     dar_params_train(&r->net.p, roles);
@@ -39,6 +41,7 @@ static void run_init(run *r, const char *where, unsigned roles, dar_dtype storag
         dar_rng_fill_normal(&r->net.p.at[i]->x, seed, 3 * i, 1);
         dar_rng_fill_normal(&r->optim.m[i], seed, 3 * i + 1, 1e-3);
         dar_rng_fill_uniform(&r->optim.v[i], seed, 3 * i + 2, 0, 1e-6);
+        if (bf16_moments) dar_rng_fill_normal(&r->optim.average[i], seed, 1000 + i, 1);
     }
     r->optim.steps = (int64_t)seed + 5;
     r->optim.skipped = 4;
@@ -75,6 +78,7 @@ static void same_run(const run *a, const run *b)
         same_tensor(q->name, &q->x, &b->net.p.at[i]->x);
         same_tensor(q->name, &a->optim.m[i], &b->optim.m[i]);
         same_tensor(q->name, &a->optim.v[i], &b->optim.v[i]);
+        if (a->optim.average[i].data) same_tensor(q->name, &a->optim.average[i], &b->optim.average[i]);
     }
     assert_int_equal(a->optim.steps, b->optim.steps);
     assert_int_equal(a->optim.skipped, b->optim.skipped);

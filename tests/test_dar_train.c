@@ -132,6 +132,61 @@ static void stopped_and_resumed(void **state)
     }
 }
 
+/* Values of a part's tensors: those of `a` whose names begin with `prefix` are those of `b` without it. */
+static size_t same_values(const char *a, const char *prefix, const char *b)
+{
+    dar_weights *x, *y;
+    size_t n = 0, skip = strlen(prefix);
+    dar_err e;
+    CHECK(dar_weights_open(&x, a, &e) == DAR_OK && dar_weights_open(&y, b, &e) == DAR_OK, "%s", e.text);
+    for (size_t i = 0; i < dar_weights_count(x); i++) {
+        const dar_weight *item = dar_weights_at(x, i);
+        dar_tensor p, q;
+        if (strncmp(item->name, prefix, skip) != 0 || !dar_weights_find(y, item->name + skip)) continue;
+        CHECK(dar_weights_tensor(x, item->name, &p, &e) == DAR_OK, "%s", e.text);
+        CHECK(dar_weights_tensor(y, item->name + skip, &q, &e) == DAR_OK, "%s", e.text);
+        n += dar_tensor_bytes(&p) == dar_tensor_bytes(&q) && memcmp(p.data, q.data, dar_tensor_bytes(&p)) == 0;
+    }
+    dar_weights_close(x);
+    dar_weights_close(y);
+    return n;
+}
+
+/* With an average of the weights, checkpoints give that to others; training goes on from the weights, and does not know
+ * of it: they are those of a run without.  Stopped and resumed: the same bits. */
+static void averaged(void **state)
+{
+    (void)state;
+    static const char decay[] = "ema_decay=0.8", twenty[] = "max_train_steps=20";
+    static const char optimizer[] = "ema/checkpoint-20/optimizer.safetensors";
+    GOOD("lora.json", SET("output_dir=plain"), SET(twenty), SET("adam_moments=bf16"), SET("lr_scheduler=cosine"));
+    GOOD("lora.json", SET("output_dir=ema"), SET(twenty), SET("adam_moments=bf16"), SET("lr_scheduler=cosine"),
+         SET(decay), SET("validation.steps=20"));
+    assert_int_equal(same_values(optimizer, "w.", "plain/checkpoint-20/lora.safetensors"), 40);
+    assert_int_equal(same_values(optimizer, "w.", "ema/checkpoint-20/lora.safetensors"), 0);
+    GOOD("lora.json", SET("output_dir=ema-parts"), SET(twenty), SET("adam_moments=bf16"), SET("lr_scheduler=cosine"),
+         SET(decay), SET("checkpointing_steps=7"), SET("validation.steps=0"));
+    assert_int_equal(run_remove("ema-parts/checkpoint-20"), 0);
+    GOOD("lora.json", SET("output_dir=ema-parts"), SET(twenty), SET("adam_moments=bf16"), SET("lr_scheduler=cosine"),
+         SET(decay), SET("checkpointing_steps=7"), "--resume", "auto");
+    same_state("ema/checkpoint-20", "ema-parts/checkpoint-20");
+    BAD(2, "found no w.", "lora.json", SET("output_dir=bad"), SET(decay), SET("adam_moments=bf16"), "--resume",
+        "plain/checkpoint-20");
+    assert_int_equal(run_remove("bad"), 0);
+}
+
+/* A rate for all by pattern is a rate for all. */
+static void rates(void **state)
+{
+    (void)state;
+    GOOD("lora.json", SET("output_dir=rate"), SET("max_train_steps=5"), SET("learning_rate=0.01"));
+    GOOD("lora.json", SET("output_dir=rates"), SET("max_train_steps=5"), SET("learning_rate=0"),
+         SET("learning_rates={\"control_adapter.*\": 1, \"*\": 0.01}"));
+    same_state("rate/checkpoint-5", "rates/checkpoint-5");
+    BAD(2, "learning_rates: found \"none.*\", expected", "lora.json", SET("output_dir=bad"), "--dry-run",
+        SET("learning_rates={\"none.*\": 1}"));
+}
+
 /* Asked to stop, a run saves and says so; then it goes on. */
 static void interrupted(void **state)
 {
@@ -166,7 +221,7 @@ static const char autoencoder[] =
     "{\"model\": \"small\", \"train\": \"vae\", \"from_scratch\": true, \"data\": [\"clips\"],"
     "\"output_dir\": \"vae\", \"mixed_precision\": \"f32\", \"learning_rate\": 0.005,"
     "\"lr_warmup_steps\": 2, \"max_train_steps\": 40, \"train_batch_size\": 2, \"max_grad_norm\": 1,"
-    "\"checkpointing_steps\": 10, \"vae\": {\"frames\": 5, \"height\": 16, \"width\": 24},"
+    "\"checkpointing_steps\": 10, \"ema_decay\": 0.5, \"vae\": {\"frames\": 5, \"height\": 16, \"width\": 24},"
     "\"validation\": {\"data\": [\"clips\"], \"steps\": 20}}";
 
 /* From nothing, on cuts of the clips; stopped and resumed; and a backbone learns on latents of what was learned. */
@@ -322,10 +377,10 @@ static void refusals(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(a_backbone),  cmocka_unit_test(every_set),  cmocka_unit_test(stopped_and_resumed),
-        cmocka_unit_test(interrupted), cmocka_unit_test(precisions), cmocka_unit_test(an_autoencoder),
-        cmocka_unit_test(merged),      cmocka_unit_test(exported),   cmocka_unit_test(empty_prompt),
-        cmocka_unit_test(refusals),
+        cmocka_unit_test(a_backbone), cmocka_unit_test(every_set),      cmocka_unit_test(stopped_and_resumed),
+        cmocka_unit_test(averaged),   cmocka_unit_test(rates),          cmocka_unit_test(interrupted),
+        cmocka_unit_test(precisions), cmocka_unit_test(an_autoencoder), cmocka_unit_test(merged),
+        cmocka_unit_test(exported),   cmocka_unit_test(empty_prompt),   cmocka_unit_test(refusals),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-train") || !run_find(bundler, argv[0], "dar-bundle") ||

@@ -144,14 +144,18 @@ static int kill_often(const char *run, const char *kind, uint64_t which, int mos
 static void killed(void **state)
 {
     (void)state;
-    static const char *const kinds[] = { "adam_moments=f32", "adam_moments=bf16" };
-    char run[32];
+    static const char *const kinds[] = { "adam_moments=f32", "adam_moments=bf16", "ema_decay=0.9" };
+    char run[32], whole[32];
     int done = 0;
-    for (int i = 0; i < 2; i++) leave_alone(start(i ? "whole-1" : "whole-0", kinds[i]));
+    for (int i = 0; i < 3; i++) {
+        snprintf(whole, sizeof whole, "whole-%d", i);
+        leave_alone(start(whole, kinds[i]));
+    }
     for (int i = 0; done < kills; i++) {
         snprintf(run, sizeof run, "killed-%d", i);
-        done += kill_often(run, kinds[i % 2], (uint64_t)i, kills - done);
-        same_end(run, i % 2 ? "whole-1" : "whole-0");
+        snprintf(whole, sizeof whole, "whole-%d", i % 3);
+        done += kill_often(run, kinds[i % 3], (uint64_t)i, kills - done);
+        same_end(run, whole);
         assert_int_equal(run_remove(run), 0);
     }
     printf("note: %d kills, %d of them while a checkpoint was written or removed\n", done, saving);

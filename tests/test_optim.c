@@ -1,4 +1,5 @@
-/* test_optim.c: AdamW against torch's, steps that are not finite, moments in bf16, threads. */
+/* test_optim.c: AdamW against torch's, steps that are not finite, rates by name, averages, moments in bf16,
+ * threads. */
 #include "tests/test.h"
 
 #include "lib/json.h"
@@ -141,6 +142,81 @@ static void too_many(void **state)
     net_free(&n);
 }
 
+/* A tensor with a rate of its own learns as in a net where all have it; the last pattern that matches counts. */
+static void rates_by_name(void **state)
+{
+    (void)state;
+    dar_optim_config c = dar_optim_default();
+    net mixed, fast, slow;
+    c.max_norm = 0;
+    c.warmup = 3;
+    c.rate = 1e-3;
+    net_init(&mixed, DAR_F64, &c);
+    net_init(&slow, DAR_F64, &c);
+    c.rate = 1e-1;
+    net_init(&fast, DAR_F64, &c);
+    assert_int_equal(dar_optim_set_rate(&mixed.o, "*", 1e-1), 2);
+    assert_int_equal(dar_optim_set_rate(&mixed.o, "[b-z]*", 1e-3), 1);
+    assert_int_equal(dar_optim_set_rate(&mixed.o, "froz*", 1), 0);
+    assert_int_equal(dar_optim_set_rate(&mixed.o, "aa", 1), 0);
+    for (int k = 0; k < 6; k++) {
+        net *all[] = { &mixed, &fast, &slow };
+        for (size_t i = 0; i < DAR_COUNT(all); i++) {
+            gradient(all[i], k);
+            all[i]->o.schedule = k < 4 ? 1 : 0.5;
+            dar_optim_report r = dar_optim_step(&all[i]->o);
+            double factor = k < 3 ? k / 3.0 : k < 4 ? 1 : 0.5;
+            CHECK_NEAR("rate", r.rate, factor * all[i]->o.config.rate, 1e-17);
+        }
+        for (size_t i = 0; i < 8; i++) CHECK_NEAR("weight", weight(&mixed, i), weight(i < 6 ? &fast : &slow, i), 0);
+    }
+    CHECK(weight(&fast, 0) != weight(&slow, 0), "both rates give %g", weight(&fast, 0));
+    net_free(&mixed);
+    net_free(&fast);
+    net_free(&slow);
+}
+
+/* The average follows the weights, which do not know of it.  f32: each step rounds three numbers below 2. */
+static void averages(void **state)
+{
+    (void)state;
+    enum { STEPS = 40 };
+    for (int type = DAR_F64; type <= DAR_F32; type++) {
+        dar_optim_config c = dar_optim_default();
+        net with, without;
+        double bound = 3 * STEPS * (type == DAR_F64 ? 0x1p-53 : 0x1p-24), a[8];
+        c.rate = 1e-2;
+        c.warmup = 2;
+        net_init(&without, (dar_dtype)type, &c);
+        c.average = 0.7;
+        net_init(&with, (dar_dtype)type, &c);
+        dar_dtype_set((dar_dtype)type, without.a->x.data, 0, 0.75);
+        dar_dtype_set((dar_dtype)type, with.a->x.data, 0, 0.75);
+        dar_optim_restart_average(&with.o);
+        dar_optim_swap(&with.o);
+        CHECK_NEAR("average at the start", weight(&with, 0), 0.75, 0);
+        dar_optim_swap(&with.o);
+        for (int k = 0; k < STEPS; k++) {
+            gradient(&with, k / 3.0);
+            gradient(&without, k / 3.0);
+            dar_optim_step(&with.o);
+            dar_optim_step(&without.o);
+            double decay = k ? fmin(0.7, (1.0 + k) / (10 + k)) : 0;
+            for (size_t i = 0; i < 8; i++) a[i] = (k ? decay * a[i] : 0) + (1 - decay) * weight(&with, i);
+            gradient(&with, NAN);
+            assert_true(dar_optim_step(&with.o).skipped);
+            dar_optim_swap(&with.o);
+            for (size_t i = 0; i < 8; i++) CHECK_NEAR("average", weight(&with, i), a[i], bound);
+            dar_optim_swap(&with.o);
+            dar_optim_swap(&without.o);
+            for (size_t i = 0; i < 8; i++) CHECK_NEAR("weight", weight(&with, i), weight(&without, i), 0);
+        }
+        CHECK(fabs(a[0] - weight(&with, 0)) > 1e-3, "the average is %g, the weight %g", a[0], weight(&with, 0));
+        net_free(&with);
+        net_free(&without);
+    }
+}
+
 /* ---------------------------------------------------------------- moments in bf16 */
 
 #define N 50000
@@ -160,6 +236,7 @@ static void large_init(large *l, bool bf16_moments)
     c.decay = 0;
     c.bf16_moments = bf16_moments;
     c.seed = 5;
+    c.average = 0.9;
     assert_int_equal(dar_arena_init(&l->arena, "test", 8 << 20, NULL), DAR_OK);
     dar_params_init(&l->p, &l->arena, DAR_F32);
     l->w = dar_params_add(&l->p, (dar_param_info){ DAR_PARAM_LORA, false, DAR_FRESH_VALUE, 0 }, DAR_SHAPE(N), "w");
@@ -228,6 +305,7 @@ static void same_bits(void **state)
         assert_memory_equal(first.o.m[0].data, other.o.m[0].data, 2 * N);
         assert_memory_equal(first.o.v[0].data, other.o.v[0].data, 2 * N);
         assert_memory_equal(first.w->x.data, other.w->x.data, 4 * N);
+        assert_memory_equal(first.o.average[0].data, other.o.average[0].data, 4 * N);
         large_free(&other);
         dar_threads_set(before);
     }
@@ -238,7 +316,8 @@ static void same_bits(void **state)
 int main(void)
 {
     static const struct CMUnitTest tests[] = { cmocka_unit_test(against_torch), cmocka_unit_test(not_finite),
-                                               cmocka_unit_test(too_many), cmocka_unit_test(unbiased),
+                                               cmocka_unit_test(too_many),      cmocka_unit_test(rates_by_name),
+                                               cmocka_unit_test(averages),      cmocka_unit_test(unbiased),
                                                cmocka_unit_test(same_bits) };
     return cmocka_run_group_tests_name("optim", tests, NULL, NULL) != 0;
 }

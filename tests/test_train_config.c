@@ -73,7 +73,8 @@ static void the_papers(void **state)
     assert_int_equal(c.storage, DAR_BF16);
     assert_int_equal(c.first, DAR_FIRST_EXCLUDE);
     CHECK_NEAR("shift", c.shift, 5, 0);
-    CHECK_NEAR("rate at the end", dar_train_rate(&c, 9999), 1e-4, 0);
+    CHECK_NEAR("schedule at the end", dar_train_schedule(&c, 9999), 1, 0);
+    CHECK(c.n_rates == 0 && c.average == 0, "%zu rates, decay %g", c.n_rates, c.average);
     CHECK(c.condition.set.channels == 0, "a model without geometry got %zu channels", c.condition.set.channels);
     dar_train_config_close(&c);
 }
@@ -120,8 +121,8 @@ static void bases_and_overrides(void **state)
     assert_int_equal(c.file.c.adapter.geometry, 6);
     assert_int_equal(c.file.c.lora.targets, 1u << DAR_FFN_UP);
     assert_int_equal(c.file.c.lora.rank, 7);
-    CHECK_NEAR("rate before", dar_train_rate(&c, 90), 0.5, 0);
-    CHECK_NEAR("rate of the last", dar_train_rate(&c, 99), 0.05, 1e-15);
+    CHECK_NEAR("schedule before", dar_train_schedule(&c, 90), 1, 0);
+    CHECK_NEAR("schedule of the last", dar_train_schedule(&c, 99), 0.1, 1e-15);
 
     /* What is stored is read as the same. */
     dar_json_writer w = { 0 }, again = { 0 };
@@ -136,6 +137,57 @@ static void bases_and_overrides(void **state)
     dar_json_writer_free(&again);
 }
 
+/* The factor on rates, at some steps of 1000. */
+static void schedules(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *set[3];
+        int64_t warmup;
+        double at[4]; /* steps 0, 500, 750, 999 */
+    } kinds[] = {
+        { { "lr_scheduler=constant_with_warmup", "lr_decay_share=0.5", "lr_warmup_steps=20" }, 20, { 1, 1, 1, 1 } },
+        { { "lr_scheduler=constant", "lr_decay_share=0.5", "lr_warmup_steps=20" }, 0, { 1, 1, 1, 1 } },
+        { { "lr_scheduler=linear", "lr_decay_share=0", "lr_warmup_steps=0" }, 0, { 1, 0.5, 0.25, 0.001 } },
+        { { "lr_scheduler=linear", "lr_decay_share=0.5", "lr_warmup_steps=20" }, 20, { 1, 1, 0.5, 0.002 } },
+        { { "lr_scheduler=linear", "lr_decay_share=0.5", "lr_decay_steps=250" }, 200, { 1, 1, 1, 0.004 } },
+        { { "lr_scheduler=linear", "lr_decay_share=0", "lr_warmup_steps=500" }, 500, { 1, 1, 0.5, 0.002 } },
+        { { "lr_scheduler=cosine", "lr_decay_share=1", "lr_warmup_steps=20" },
+          20,
+          { 1, 0.5, 0.14644660940672624, 2.4674e-6 } },
+    };
+    static const int64_t steps[] = { 0, 500, 750, 999 };
+    const char *path = write_config("s.json", "\"output_dir\": \"s\", \"max_train_steps\": 1000");
+    for (size_t i = 0; i < DAR_COUNT(kinds); i++) {
+        dar_train_config c;
+        dar_err e;
+        ok(dar_train_config_open(&c, path, kinds[i].set, 3, &e), &e);
+        assert_int_equal(c.warmup, kinds[i].warmup);
+        for (size_t k = 0; k < DAR_COUNT(steps); k++)
+            CHECK_NEAR(kinds[i].set[0], dar_train_schedule(&c, steps[k]), kinds[i].at[k], 1e-10);
+        dar_train_config_close(&c);
+    }
+}
+
+/* Rates by pattern, those of a base first. */
+static void rates(void **state)
+{
+    (void)state;
+    dar_train_config c;
+    dar_err e;
+    write_config("r.json", "\"output_dir\": \"r\", \"learning_rates\": {\"linear.*\": 3e-5, \"a.b\": 1}");
+    scratch_text(in_dir("q.json"), "{\"base\": \"r.json\", \"learning_rates\": {\"*\": 2, \"a.b\": 0}}");
+    ok(dar_train_config_open(&c, in_dir("q.json"), NULL, 0, &e), &e);
+    static const char *const patterns[] = { "linear.*", "a.b", "*" };
+    static const double expected[] = { 3e-5, 0, 2 };
+    assert_int_equal(c.n_rates, 3);
+    for (size_t i = 0; i < 3; i++) {
+        same_text(c.rates[i].pattern, patterns[i]);
+        CHECK_NEAR(patterns[i], c.rates[i].rate, expected[i], 0);
+    }
+    dar_train_config_close(&c);
+}
+
 static void refusals(void **state)
 {
     (void)state;
@@ -146,6 +198,10 @@ static void refusals(void **state)
         { "\"output_dir\": \"x\", \"learning_rat\": 1", "bad.json: learning_rat: unknown key; did you mean "
                                                         "'learning_rate'?" },
         { "\"output_dir\": \"x\", \"train\": \"all\"", "bad.json: train: found \"all\", expected" },
+        { "\"output_dir\": \"x\", \"learning_rates\": {\"a.*\": \"b\"}",
+          "learning_rates.a.*: found \"b\", expected a number" },
+        { "\"output_dir\": \"x\", \"learning_rates\": 3", "learning_rates: found 3, expected an object" },
+        { "\"output_dir\": \"x\", \"lr_decay_share\": 2", "lr_decay_share: found 2, expected a number from 0 to 1" },
         { "\"output_dir\": \"x\", \"data\": [3]", "bad.json: data[0]: found 3, expected a string" },
         { "\"output_dir\": \"x\", \"condition\": {\"chanels\": \"dar\"}",
           "small.json: condition.chanels: unknown key; did you mean 'channels'?" },
@@ -166,10 +222,8 @@ static void refusals(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(all_are_read),
-        cmocka_unit_test(the_papers),
-        cmocka_unit_test(bases_and_overrides),
-        cmocka_unit_test(refusals),
+        cmocka_unit_test(all_are_read), cmocka_unit_test(the_papers), cmocka_unit_test(bases_and_overrides),
+        cmocka_unit_test(schedules),    cmocka_unit_test(rates),      cmocka_unit_test(refusals),
     };
     return cmocka_run_group_tests(tests, scratch_make, scratch_remove) != 0;
 }

@@ -281,7 +281,7 @@ static void test_overfits(void **state)
     dar_optim_init(&optim, &o, &n.p, &n.weights);
     double first = dar_vae_step_look(&n.s, &n.x, NULL).square;
     for (int64_t k = 0; k < 300; k++) {
-        optim.config.rate = o.rate * fmin(1, (300 - (double)k) / 150);
+        optim.schedule = fmin(1, (300 - (double)k) / 150);
         dar_vae_step_run(&n.s, &n.x, k, 0);
         CHECK(!dar_optim_step(&optim).skipped, "step %d is not finite", (int)k);
     }

@@ -10,9 +10,13 @@
  *     lora.safetensors         trained low-rank additions, as models/lora.h writes them
  *     adapter.safetensors      trained parameters of the adapter, named as in the public checkpoint
  *     dit.safetensors          or vae: instead of the adapter, where the network itself is trained: all of it
- *     optimizer.safetensors    moments m.NAME, v.NAME of every trained parameter, as they are stored
+ *     optimizer.safetensors    moments m.NAME, v.NAME of every trained parameter, as they are stored; where weights are
+ *                              averaged, w.NAME too: the weights that training goes on from
  *     config.json, model.json  the resolved configuration; what the weights are, for dar-sample
  *     checkpoint.json          step, counts, seed; size and SHA-256 of every file above
+ *
+ * Where weights are averaged, it is the average that the files for others hold: save and resume are called with it in
+ * its place (dar_optim_swap).
  *
  * Trained tensors are written in the type they are trained in, so all of it comes back bit for bit.  What is random in
  * training is a pure function of seed and step, so those two are the state of the generators and of the data order.

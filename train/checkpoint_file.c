@@ -57,7 +57,7 @@ static bool has(const dar_checkpoint *c, part which)
 typedef struct items {
     dar_safetensors_item *item;
     bool *fixed;                      /* not trained: written, and known already when it is read */
-    char (*name)[DAR_PARAM_NAME + 2]; /* of moments */
+    char (*name)[DAR_PARAM_NAME + 2]; /* of what is the optimiser's */
     size_t n;
 } items;
 
@@ -68,17 +68,17 @@ static void items_free(items *x)
     free(x->name);
 }
 
-static void add_moment(items *x, char which, const dar_param *q, const dar_tensor *moment)
+static void add_state(items *x, char which, const dar_param *q, const dar_tensor *state)
 {
     snprintf(x->name[x->n], sizeof x->name[x->n], "%c.%s", which, q->name);
-    x->item[x->n] = (dar_safetensors_item){ x->name[x->n], *moment };
+    x->item[x->n] = (dar_safetensors_item){ x->name[x->n], *state };
     x->n++;
 }
 
 /* The tensors of a part; of the LoRA without its alphas. */
 static dar_status collect(items *x, const dar_checkpoint *c, part which, dar_err *e)
 {
-    size_t most = 2 * c->params->count + 1;
+    size_t most = 3 * c->params->count + 1;
     *x = (items){ calloc(most, sizeof *x->item), calloc(most, sizeof *x->fixed), calloc(most, sizeof *x->name), 0 };
     if (!x->item || !x->fixed || !x->name) {
         items_free(x);
@@ -88,8 +88,9 @@ static dar_status collect(items *x, const dar_checkpoint *c, part which, dar_err
         const dar_param *q = c->params->at[i];
         bool lora = q->info.role == DAR_PARAM_LORA;
         if (which == OPTIMIZER && q->trainable) {
-            add_moment(x, 'm', q, &c->optim->m[i]);
-            add_moment(x, 'v', q, &c->optim->v[i]);
+            add_state(x, 'm', q, &c->optim->m[i]);
+            add_state(x, 'v', q, &c->optim->v[i]);
+            if (c->optim->average[i].data) add_state(x, 'w', q, &c->optim->average[i]);
         } else if (which == NETWORK ? !lora : which != OPTIMIZER && q->trainable && lora == (which == LORA)) {
             x->fixed[x->n] = !q->trainable;
             x->item[x->n++] = (dar_safetensors_item){ q->name, q->x };

@@ -10,11 +10,13 @@
 #define DEPTH  8                            /* files that are each other's base */
 #define NEEDED NULL
 
+#define MOST_RATE 1e3
+
 const char *const dar_recompute_name[] = { "auto", "none", "cheap", "selective", "full", NULL };
 
 static const char *const what_names[] = { "lora", "full", "vae", NULL };
 static const char *const storage_names[] = { "f64", "f32", "bf16", NULL }; /* dar_dtype */
-static const char *const scheduler_names[] = { "constant", "linear", "cosine", NULL };
+static const char *const scheduler_names[] = { "constant_with_warmup", "constant", "linear", "cosine", NULL };
 static const char *const moment_names[] = { "f32", "bf16", NULL };
 static const char *const first_names[] = { "exclude", "include", "noisy", NULL };
 static const char *const posterior_names[] = { "mean", "sample", NULL };
@@ -52,15 +54,17 @@ static const row table[] = {
     { NULL, "gradient_checkpointing", CHOICE, AT(recompute), DAR_RECOMPUTE_AUTO, 0, 0, dar_recompute_name },
     { NULL, "memory_budget", NUMBER, AT(budget), 0, 0, 1e9, NULL },
 
-    { NULL, "learning_rate", NUMBER, AT(rate), 1e-4, 0, 1e3, NULL },
-    { NULL, "lr_scheduler", CHOICE, AT(scheduler), DAR_LR_CONSTANT, 0, 0, scheduler_names },
+    { NULL, "learning_rate", NUMBER, AT(rate), 1e-4, 0, MOST_RATE, NULL },
+    { NULL, "lr_scheduler", CHOICE, AT(scheduler), DAR_LR_WARMUP, 0, 0, scheduler_names },
     { NULL, "lr_warmup_steps", INT, AT(warmup), 200, 0, COUNT, NULL },
+    { NULL, "lr_decay_share", NUMBER, AT(decay_share), 0, 0, 1, NULL },
     { NULL, "lr_decay_steps", INT, AT(decay_steps), 0, 0, COUNT, NULL },
     { NULL, "adam_beta1", NUMBER, AT(beta1), 0.9, 0, 0.9999999, NULL },
     { NULL, "adam_beta2", NUMBER, AT(beta2), 0.999, 0, 0.9999999, NULL },
     { NULL, "adam_epsilon", NUMBER, AT(eps), 1e-10, 1e-30, 1, NULL },
     { NULL, "adam_weight_decay", NUMBER, AT(decay), 0.03, 0, 1e3, NULL },
     { NULL, "adam_moments", CHOICE, AT(moments), 0, 0, 0, moment_names },
+    { NULL, "ema_decay", NUMBER, AT(average), 0, 0, 0.9999999, NULL },
     { NULL, "max_grad_norm", NUMBER, AT(max_norm), 0.05, 0, 1e30, NULL },
     { NULL, "max_bad_steps", INT, AT(patience), 20, 1, COUNT, NULL },
     { NULL, "max_train_steps", INT, AT(steps), 10000, 1, COUNT, NULL },
@@ -114,10 +118,22 @@ static void read_list(dar_json list)
     for (dar_json x = dar_json_first(list); x.item; x = dar_json_next(x)) dar_json_text(x, NULL, NULL);
 }
 
+static void read_rates(dar_train_config *c, dar_json rates)
+{
+    if (dar_json_size(rates) > DAR_TRAIN_RATES) dar_json_reject(rates, NULL, "at most %d patterns", DAR_TRAIN_RATES);
+    else
+        for (dar_json x = dar_json_first(rates); x.item; x = dar_json_next(x)) {
+            c->rates[c->n_rates].pattern = dar_json_key(x);
+            c->rates[c->n_rates++].rate = dar_json_number(x, NULL, NAN, 0, MOST_RATE);
+        }
+}
+
 static dar_status read_keys(dar_train_config *c, dar_err *e)
 {
     dar_json root = dar_json_root(c->doc);
     for (size_t i = 0; i < DAR_COUNT(table); i++) read_row(c, root, &table[i]);
+    if (c->scheduler == DAR_LR_CONSTANT) c->warmup = 0;
+    read_rates(c, dar_json_object(root, "learning_rates"));
     read_list(dar_json_array(root, "data"));
     read_list(dar_json_array(dar_json_object(root, "validation"), "data"));
     read_list(dar_json_get(root, "target_modules"));
@@ -232,12 +248,19 @@ dar_json dar_train_config_list(const dar_train_config *c, const char *group, con
     return dar_json_array(group ? dar_json_object(root, group) : root, key);
 }
 
-double dar_train_rate(const dar_train_config *c, int64_t k)
+static int64_t decay_steps(const dar_train_config *c)
 {
-    int64_t n = c->decay_steps ? c->decay_steps : c->steps - c->warmup, begin = c->steps - n;
-    if (c->scheduler == DAR_LR_CONSTANT || k <= begin || n <= 0) return c->rate;
+    if (c->decay_steps) return c->decay_steps;
+    return c->decay_share > 0 ? llround(c->decay_share * (double)c->steps) : c->steps - c->warmup;
+}
+
+double dar_train_schedule(const dar_train_config *c, int64_t k)
+{
+    int64_t n = decay_steps(c), begin = c->steps - n;
+    bool falls = c->scheduler == DAR_LR_LINEAR || c->scheduler == DAR_LR_COSINE;
+    if (!falls || k <= begin || n <= 0) return 1;
     double f = fmin(1, (double)(k - begin) / (double)n);
-    return c->rate * (c->scheduler == DAR_LR_LINEAR ? 1 - f : 0.5 * (1 + cos(PI * f)));
+    return c->scheduler == DAR_LR_LINEAR ? 1 - f : 0.5 * (1 + cos(PI * f));
 }
 
 void dar_train_config_print(const dar_train_config *c, dar_json_writer *w)

@@ -27,13 +27,23 @@
  *   memory_budget                >= 0 [GB]        0        of which auto takes the fastest that fits; 0: the machine's
  *
  *   learning_rate                >= 0             1e-4
- *   lr_scheduler                 constant | linear | cosine   constant   down to 0 over the last lr_decay_steps
+ *   learning_rates               object           {}       other rates of trained tensors, by shell patterns of their
+ *                                                          names: {"linear.*": 3e-5}; of several, the last that matches
+ *   lr_scheduler                 constant_with_warmup | constant | linear | cosine   constant_with_warmup   all rates:
+ *                                                          constant: also without warm-up; the others: down to 0 at the
+ *                                                          end, after the warm-up
  *   lr_warmup_steps              0 ..             200
- *   lr_decay_steps               0 ..             0        0: all steps after the warm-up
+ *   lr_decay_share               0 .. 1           0        they go down over the last share of all steps; 0: over all
+ *                                                          after the warm-up
+ *   lr_decay_steps               0 ..             0        the same as a number of steps, which counts if it is not 0
  *   adam_beta1, adam_beta2       0 .. 1           0.9, 0.999
  *   adam_epsilon                 > 0              1e-10
  *   adam_weight_decay            >= 0             0.03
  *   adam_moments                 f32 | bf16       f32      bf16: half the memory, rounded at random
+ *   ema_decay                    0 .. 1           0        of the running average of trained weights (train/optim.h);
+ *                                                          if not 0, that is what is validated, and what checkpoints
+ *                                                          hold as weights, beside the weights that training goes on
+ *                                                          from
  *   max_grad_norm                >= 0             0.05     0: no clipping
  *   max_bad_steps                1 ..             20       in a row, whose gradients are not finite
  *   max_train_steps              1 ..             10000
@@ -88,10 +98,12 @@ typedef enum dar_recompute {
     DAR_RECOMPUTE_MOST,
     DAR_RECOMPUTE_ALL
 } dar_recompute;
-typedef enum dar_lr_scheduler { DAR_LR_CONSTANT, DAR_LR_LINEAR, DAR_LR_COSINE } dar_lr_scheduler;
+typedef enum dar_lr_scheduler { DAR_LR_WARMUP, DAR_LR_CONSTANT, DAR_LR_LINEAR, DAR_LR_COSINE } dar_lr_scheduler;
 typedef enum dar_first_frame { DAR_FIRST_EXCLUDE, DAR_FIRST_INCLUDE, DAR_FIRST_NOISY } dar_first_frame;
 
 extern const char *const dar_recompute_name[]; /* "auto", ..., NULL */
+
+#define DAR_TRAIN_RATES 32 /* patterns with a rate of their own, at most */
 
 /* Texts live as long as the configuration.  Choices are int: rows of one table read them. */
 typedef struct dar_train_config {
@@ -108,9 +120,15 @@ typedef struct dar_train_config {
     double budget; /* [GB] */
 
     double rate;
+    struct {
+        const char *pattern;
+        double rate;
+    } rates[DAR_TRAIN_RATES];
+    size_t n_rates;
     int scheduler; /* dar_lr_scheduler */
     int64_t warmup, decay_steps;
-    double beta1, beta2, eps, decay, max_norm;
+    double decay_share;
+    double beta1, beta2, eps, decay, average, max_norm;
     int moments; /* 0: f32, 1: bf16 */
     int64_t patience, steps, batch, accumulate, ahead;
     int64_t save_every, keep;
@@ -143,8 +161,8 @@ void dar_train_config_close(dar_train_config *c); /* accepts a zeroed one */
 /* The texts of a list: "data", or "validation.data". */
 dar_json dar_train_config_list(const dar_train_config *c, const char *group, const char *key);
 
-/* Learning rate of step k = 0, 1, ..., of which the warm-up is the optimiser's. */
-double dar_train_rate(const dar_train_config *c, int64_t k);
+/* What rates are multiplied with in step k = 0, 1, ...; the warm-up, which comes on top, is the optimiser's. */
+double dar_train_schedule(const dar_train_config *c, int64_t k);
 
 /* The resolved configuration as JSON text. */
 void dar_train_config_print(const dar_train_config *c, dar_json_writer *w);

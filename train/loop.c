@@ -58,6 +58,13 @@ static void count_parameters(dar_loop *l)
     }
 }
 
+static const char *a_trained_name(const dar_params *p)
+{
+    for (size_t i = 0; i < p->count; i++)
+        if (p->at[i]->trainable) return p->at[i]->name;
+    return "none";
+}
+
 static dar_status init_optim(dar_loop *l, bool plan, dar_err *e)
 {
     const dar_train_config *c = l->c;
@@ -65,9 +72,14 @@ static dar_status init_optim(dar_loop *l, bool plan, dar_err *e)
     o.bf16_moments = c->moments != 0;
     o.seed = (uint64_t)c->seed;
     o.patience = c->patience;
+    o.average = c->average;
     DAR_TRY(plan ? dar_arena_init_plan(&l->moments, "moments", e)
                  : dar_arena_init(&l->moments, "moments", l->plan.moments, e));
     dar_optim_init(&l->optim, &o, l->params, &l->moments);
+    for (size_t i = 0; i < c->n_rates; i++)
+        if (!dar_optim_set_rate(&l->optim, c->rates[i].pattern, c->rates[i].rate))
+            return dar_fail(e, DAR_ERR_USAGE, "learning_rates: found \"%s\", expected a pattern of names such as %s",
+                            c->rates[i].pattern, a_trained_name(l->params));
     return DAR_OK;
 }
 
@@ -116,8 +128,11 @@ static dar_status open_run(dar_loop *l, const char *resume, dar_err *e)
     l->saver.config = l->text[0].text;
     l->saver.keep = c->keep;
     DAR_TRY(dar_checkpoint_open(&l->saver, e));
+    dar_optim_swap(&l->optim);
     DAR_TRY(dar_checkpoint_resume(&l->saver, resume, e));
+    dar_optim_swap(&l->optim);
     DAR_TRY(l->learner->prepare(l, false, e));
+    if (!l->saver.step) dar_optim_restart_average(&l->optim);
     dar_journal_options j = { c->output, c->steps, p->tokens, p->flops, p->peak };
     return dar_journal_open(&l->journal, &j, l->saver.step, e);
 }
@@ -167,7 +182,7 @@ static dar_status run_step(dar_loop *l, int64_t k, dar_err *e)
         x.loss += b.loss / (double)c->accumulate;
         x.sigma += b.sigma / (double)c->accumulate;
     }
-    l->optim.config.rate = dar_train_rate(c, k);
+    l->optim.schedule = dar_train_schedule(c, k);
     dar_optim_report r = dar_optim_step(&l->optim);
     x.norm = r.norm, x.rate = r.rate, x.skipped = r.skipped, x.nonfinite = r.nonfinite;
     x.seconds = dar_log_clock() - began;
@@ -192,18 +207,26 @@ static bool every(int64_t k, int64_t steps)
     return steps && k % steps == 0;
 }
 
-dar_status dar_loop_run(dar_loop *l, dar_err *e)
+/* After `done` steps: look and save, if it is time; stop, if that is asked. */
+static dar_status look_up(dar_loop *l, int64_t done, dar_err *e)
 {
     const dar_train_config *c = l->c;
-    for (int64_t k = l->saver.step; k < c->steps;) {
+    bool last = done == c->steps;
+    if (!dar_interrupted() && (last || every(done, c->validate_every))) DAR_TRY(l->learner->validate(l, done, e));
+    bool stop = dar_interrupted();
+    if (stop || last || every(done, c->save_every)) DAR_TRY(save(l, done, e));
+    if (!stop || last) return DAR_OK;
+    return dar_fail(e, DAR_ERR_INTERRUPTED, "%s: stopped and saved after step %lld; --resume auto goes on", c->output,
+                    (long long)done);
+}
+
+dar_status dar_loop_run(dar_loop *l, dar_err *e)
+{
+    for (int64_t k = l->saver.step; k < l->c->steps;) {
         DAR_TRY(run_step(l, k++, e));
-        bool last = k == c->steps;
-        if (!dar_interrupted() && (last || every(k, c->validate_every))) DAR_TRY(l->learner->validate(l, k, e));
-        bool stop = dar_interrupted();
-        if (stop || last || every(k, c->save_every)) DAR_TRY(save(l, k, e));
-        if (stop && !last)
-            return dar_fail(e, DAR_ERR_INTERRUPTED, "%s: stopped and saved after step %lld; --resume auto goes on",
-                            c->output, (long long)k);
+        dar_optim_swap(&l->optim);
+        DAR_TRY(look_up(l, k, e));
+        dar_optim_swap(&l->optim);
     }
     return DAR_OK;
 }

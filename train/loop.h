@@ -7,7 +7,8 @@
  * when to save.  What learns is a learner (train/learner.h), a table of calls.
  *
  * Step k = 0, 1, ... takes the batches k accumulation ... of the loader; everything else that it depends on is in the
- * last checkpoint.  Asked to stop (lib/program.h), a run saves one and returns DAR_ERR_INTERRUPTED. */
+ * last checkpoint.  Where weights are averaged (ema_decay), the average is what is validated, and what checkpoints give
+ * others.  Asked to stop (lib/program.h), a run saves one and returns DAR_ERR_INTERRUPTED. */
 #ifndef DAR_TRAIN_LOOP_H
 #define DAR_TRAIN_LOOP_H
 
@@ -49,15 +50,17 @@ typedef struct dar_learner {
      * planning arenas, it sets l->plan.weights. */
     dar_status (*network)(dar_loop *l, bool plan, dar_err *e);
 
-    /* The rest.  Planning, it counts the l->plan that is its own: batches, validation, step, tokens.  Else parameters
-     * are those to start from, and l->plan.how says how steps are run. */
+    /* The rest.  Planning, it counts the l->plan that is its own: batches, validation, step, tokens.  Else it may
+     * still set the weights that a run which was not resumed, l->saver.step = 0, starts from; l->plan.how says how
+     * steps are run. */
     dar_status (*prepare)(dar_loop *l, bool plan, dar_err *e);
 
     /* Forward and backward of batch `part` of a step: gradients are added, so that after all parts they are of the
      * mean. */
     dar_status (*batch)(dar_loop *l, int64_t step, int64_t part, dar_loop_batch *b, dar_err *e);
 
-    /* After `step` steps: look at clips that are not learned from, if there are any, and tell the journal. */
+    /* After `step` steps, here and below with the average of the weights in their place: look at clips that are not
+     * learned from, if there are any, and tell the journal. */
     dar_status (*validate)(dar_loop *l, int64_t step, dar_err *e);
 
     /* Set what a checkpoint made now says of its weights, in the model's description. */
