@@ -125,6 +125,16 @@ void dar_bcast_map(const dar_bcast *b)
     if (count) dar_parallel_range(count / length * m.w.pieces, TASK / dar_least(length, DAR_PIECE), map_pieces, &m);
 }
 
+void dar_bcast_opposites(dar_bcast b, double *slope, const dar_tensor gx[2], const bool add[2])
+{
+    for (int i = 0; i < 2; i++, *slope = -*slope) {
+        if (!gx[i].data) continue;
+        b.y = &gx[i];
+        b.add = add[i];
+        dar_bcast_map(&b);
+    }
+}
+
 /* ---------------------------------------------------------------- sum */
 
 /* The work is a table of units by terms.  A unit is a piece of y: of its last dimension, or one element where that

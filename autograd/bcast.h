@@ -36,6 +36,10 @@ void dar_bcast_map(const dar_bcast *b);
  * arithmetic is in the compute type of x[0]; at most 32 terms are added in f32, the rest in f64.  fn NULL: x[0]. */
 void dar_bcast_sum(const dar_bcast *b);
 
+/* Gradients of a sum of f(x[0] - x[1]), of one shape: b->fn gives that of x[0] with *slope as it is, that of x[1] with
+ * its negative.  What has no gradient has no data; add: to what is there. */
+void dar_bcast_opposites(dar_bcast b, double *slope, const dar_tensor gx[2], const bool add[2]);
+
 /* n elements from `element` on in arithmetic type c, in place or in buf; step 0: the one there, n times. */
 const void *dar_bcast_get(dar_dtype c, const dar_tensor *x, size_t element, size_t step, size_t n, void *buf);
 

@@ -14,7 +14,6 @@ import os
 import sys
 
 import torch
-from diffusers import WanTransformer3DModel
 from diffusers.loaders.lora_conversion_utils import _convert_musubi_wan_lora_to_diffusers
 from peft import get_peft_model_state_dict
 from safetensors.torch import load_file, save_file
@@ -25,21 +24,10 @@ here.loader.exec_module(fixtures)
 
 
 def network(d, weights):
-    net = WanTransformer3DModel(
-        patch_size=(1, d["patch"], d["patch"]),
-        num_attention_heads=d["heads"],
-        attention_head_dim=d["width"] // d["heads"],
-        in_channels=2 * d["latent"] + d["mask"],
-        out_channels=d["latent"],
-        text_dim=d["text_width"],
-        freq_dim=d["frequencies"],
-        ffn_dim=d["ffn"],
-        num_layers=d["layers"],
-        eps=d["eps"],
-    )
+    net = fixtures.network(d)
     names = {fixtures.public(name): name for name in net.state_dict()}
     net.load_state_dict({names[k]: x.float() for k, x in weights.items() if k in names}, strict=True)
-    return net.double().eval()
+    return net.eval()
 
 
 @torch.no_grad()

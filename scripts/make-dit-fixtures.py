@@ -192,14 +192,8 @@ def learn(net, adapter, z0, known, cond, words, seed=5):
     return out
 
 
-def main():
-    text = open("models/presets/dar-test.json").read()
-    config = json.loads(re.sub(r"^\s*//.*$", "", text, flags=re.M))
-    d, a, lora = config["dit"], config["adapter"], config["lora"]
-    g = torch.Generator().manual_seed(1)
-    torch.manual_seed(1)
-
-    net = WanTransformer3DModel(
+def network(d):
+    return WanTransformer3DModel(
         patch_size=(1, d["patch"], d["patch"]),
         num_attention_heads=d["heads"],
         attention_head_dim=d["width"] // d["heads"],
@@ -209,8 +203,18 @@ def main():
         freq_dim=d["frequencies"],
         ffn_dim=d["ffn"],
         num_layers=d["layers"],
-        eps=1e-6,
+        eps=d.get("eps", 1e-6),
     ).double()
+
+
+def main():
+    text = open("models/presets/dar-test.json").read()
+    config = json.loads(re.sub(r"^\s*//.*$", "", text, flags=re.M))
+    d, a, lora = config["dit"], config["adapter"], config["lora"]
+    g = torch.Generator().manual_seed(1)
+    torch.manual_seed(1)
+
+    net = network(d)
     net.condition_embedder.timesteps_proj = TimeCode(d["frequencies"])
     exact_rope(net.rope, d["width"] // d["heads"])
     adapter = Adapter(a["rays"] + a["geometry"], a["unshuffle"], d["width"]).double()

@@ -5,6 +5,27 @@
 #include "lib/arena.h"
 #include "lib/program.h"
 
+/* Options of all of them, and where they go. */
+#define RATE_OPTIONS(model, frames, many, size)                                                                        \
+    { .name = "model",                                                                                                 \
+      .placeholder = "FILE",                                                                                           \
+      .type = DAR_ARG_TEXT,                                                                                            \
+      .target = (model),                                                                                               \
+      .standard = "models/presets/wan22-fun-5b.json",                                                                  \
+      .help = "sizes" },                                                                                               \
+        { .name = "frames",                                                                                            \
+          .placeholder = "T",                                                                                          \
+          .type = DAR_ARG_INT,                                                                                         \
+          .target = (frames),                                                                                          \
+          .standard = (many),                                                                                          \
+          .lo = 1,                                                                                                     \
+          .hi = 4097,                                                                                                  \
+          .help = "of the video, 4 n + 1" },                                                                           \
+    {                                                                                                                  \
+        .name = "size", .placeholder = "WxH", .type = DAR_ARG_SIZE, .target = (size), .standard = "832x480", .lo = 32, \
+        .hi = 8192, .help = "of the video"                                                                             \
+    }
+
 double rate_seconds(void); /* of a clock that only goes forward */
 
 /* What products of bf16 reach on all threads [FLOP/s]: median of a few tries. */

@@ -12,30 +12,11 @@ static int64_t frames, size[2];
 static const char *preset;
 static dar_common common;
 
+/* clang-format off */
 static const dar_option options[] = {
-    { .name = "model",
-      .placeholder = "FILE",
-      .type = DAR_ARG_TEXT,
-      .target = &preset,
-      .standard = "models/presets/wan22-fun-5b.json",
-      .help = "sizes" },
-    { .name = "frames",
-      .placeholder = "T",
-      .type = DAR_ARG_INT,
-      .target = &frames,
-      .standard = "9",
-      .lo = 1,
-      .hi = 4097,
-      .help = "of the video, 4 n + 1" },
-    { .name = "size",
-      .placeholder = "WxH",
-      .type = DAR_ARG_SIZE,
-      .target = size,
-      .standard = "832x480",
-      .lo = 32,
-      .hi = 8192,
-      .help = "of the video" },
+    RATE_OPTIONS(&preset, &frames, "9", size),
 };
+/* clang-format on */
 
 enum { WEIGHTS, KEPT, STEP, ARENAS };
 static const char *const arena_names[] = { "weights", "kept", "step" };

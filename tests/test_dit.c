@@ -5,6 +5,7 @@
 #include "autograd/gradcheck.h"
 #include "lib/rng.h"
 #include "tests/distance.h"
+#include "tests/fixture.h"
 #include "tests/model.h"
 
 /* ---------------------------------------------------------------- parity */
@@ -16,21 +17,13 @@ struct parity {
     double worst, worst_grad;
 };
 
-static dar_weights *open_fixture(const char *path)
-{
-    dar_weights *f;
-    dar_err e;
-    CHECK(dar_weights_open(&f, path, &e) == DAR_OK, "%s", e.text);
-    return f;
-}
-
 static void parity_init(struct parity *p, dar_dtype storage, double bound, double grad_bound)
 {
     dar_config c = model_preset("dar-test");
     dar_err e;
-    p->weights = open_fixture("tests/fixtures/dit_weights.safetensors");
-    p->lora = open_fixture("tests/fixtures/dit_lora.safetensors");
-    p->stages = open_fixture("tests/fixtures/dit_stages.safetensors");
+    p->weights = fixture_open("dit_weights.safetensors");
+    p->lora = fixture_open("dit_lora.safetensors");
+    p->stages = fixture_open("dit_stages.safetensors");
     p->bound = bound;
     p->grad_bound = grad_bound;
     p->worst = p->worst_grad = 0;

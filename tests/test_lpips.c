@@ -1,20 +1,10 @@
 /* test_lpips.c: LPIPS against its layers in f64 (scripts/make-lpips-fixtures.py). */
-#include "tests/test.h"
+#include "tests/fixture.h"
 
 #include "lib/rng.h"
 #include "models/lpips.h"
 
 enum { W = 75, H = 67 };
-
-static dar_weights *file_of(const char *name)
-{
-    char path[128];
-    dar_weights *w;
-    dar_err e;
-    snprintf(path, sizeof path, "tests/fixtures/lpips_%s.safetensors", name);
-    CHECK(dar_weights_open(&w, path, &e) == DAR_OK, "%s", e.text);
-    return w;
-}
 
 enum { ALEX, ALEX_LIN, VGG, PAIRS, FILES };
 static dar_weights *file[FILES];
@@ -22,9 +12,10 @@ static const uint8_t *a, *b, *mask;
 
 static int open_all(void **state)
 {
-    static const char *const name[FILES] = { "alex", "alex_lin", "vgg", "pairs" };
+    static const char *const name[FILES] = { "lpips_alex.safetensors", "lpips_alex_lin.safetensors",
+                                             "lpips_vgg.safetensors", "lpips_pairs.safetensors" };
     (void)state;
-    for (int i = 0; i < FILES; i++) file[i] = file_of(name[i]);
+    for (int i = 0; i < FILES; i++) file[i] = fixture_open(name[i]);
     a = dar_weights_find(file[PAIRS], "a")->data;
     b = dar_weights_find(file[PAIRS], "b")->data;
     mask = dar_weights_find(file[PAIRS], "mask")->data;

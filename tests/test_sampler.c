@@ -7,15 +7,8 @@
 #include "lib/rng_torch.h"
 #include "lib/thread.h"
 #include "tests/distance.h"
+#include "tests/fixture.h"
 #include "tests/model.h"
-
-static dar_weights *open_fixture(const char *path)
-{
-    dar_weights *f;
-    dar_err e;
-    CHECK(dar_weights_open(&f, path, &e) == DAR_OK, "%s", e.text);
-    return f;
-}
 
 /* ---------------------------------------------------------------- the fixture's first clip */
 
@@ -43,8 +36,8 @@ static void init(struct bench *b, dar_dtype storage)
     dar_config c = model_preset("dar-test");
     dar_err e;
     *b = (struct bench){ .c = dar_sampler_default() };
-    b->weights = open_fixture("tests/fixtures/dit_weights.safetensors");
-    b->lora = open_fixture("tests/fixtures/dit_lora.safetensors");
+    b->weights = fixture_open("dit_weights.safetensors");
+    b->lora = fixture_open("dit_lora.safetensors");
     model_init(&b->o, &c, storage, false);
     dar_lora_init(&b->o.m, &b->o.p, &c.lora);
     model_fixture(&b->o, b->weights);
@@ -127,7 +120,7 @@ static void same_bits(const dar_tensor *x, const dar_tensor *y)
 static void five_steps(void **state)
 {
     (void)state;
-    dar_weights *steps = open_fixture("tests/fixtures/dit_steps.safetensors");
+    dar_weights *steps = fixture_open("dit_steps.safetensors");
     for (int merged = 0; merged < 2; merged++) {
         struct bench b;
         struct walk w = { .steps = steps };
@@ -240,6 +233,15 @@ static double apart(const dar_tensor *x, int64_t i, const dar_tensor *y, int64_t
 
 static const int line[] = { 0, 1, 2, 3, 4, 5, 6, 7, 8 };
 
+/* The fixture's model, and a clip of so many of these frames; what they are taken from. */
+static struct bench init_line(struct bench *b, int64_t frames)
+{
+    init(b, DAR_F64);
+    struct bench from = { .clip = b->clip, .known = b->known, .noise = b->noise };
+    edit(b, &from, line, frames);
+    return from;
+}
+
 /* Windows as long as the clip are the plain run. */
 static void one_window(void **state)
 {
@@ -247,9 +249,7 @@ static void one_window(void **state)
     struct bench b;
     struct walk w = { 0 };
     size_t calls;
-    init(&b, DAR_F64);
-    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
-    edit(&b, &from, line, 9);
+    init_line(&b, 9);
     dar_tensor plain = sample(&b, &w, &calls);
     assert_int_equal(calls, 10);
     b.clip.window = 9, b.clip.overlap = 4, w.seen = 0;
@@ -265,9 +265,7 @@ static void several_windows(void **state)
     struct bench b;
     struct walk w = { 0 };
     size_t calls;
-    init(&b, DAR_F64);
-    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
-    edit(&b, &from, line, 9);
+    struct bench from = init_line(&b, 9);
     b.clip.window = 5, b.clip.overlap = 2; /* frames 1 2 3 4, 3 4 5 6, 5 6 7 8 */
     dar_tensor many = sample(&b, &w, &calls);
     assert_int_equal(calls, 30);
@@ -294,8 +292,7 @@ static void no_seam(void **state)
     struct bench b;
     struct walk w = { 0 };
     dar_tensor alone[2];
-    init(&b, DAR_F64);
-    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
+    struct bench from = init_line(&b, 7);
     b.c.solver.steps = 1;
     for (int i = 0; i < 2; i++) {
         w.seen = 0;

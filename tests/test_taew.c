@@ -6,6 +6,7 @@
 #include "models/load.h"
 #include "models/taew.h"
 #include "tests/distance.h"
+#include "tests/fixture.h"
 
 /* Widths of scripts/make-taew-fixtures.py. */
 static const dar_taew_config small = { .latent = 5, .encoder_width = 6, .decoder_width = { 8, 7, 6, 4 } };
@@ -17,24 +18,6 @@ typedef struct net {
     dar_tape tape;
     dar_weights *file;
 } net;
-
-static dar_weights *open_fixture(const char *name)
-{
-    char path[128];
-    dar_weights *w;
-    dar_err e;
-    snprintf(path, sizeof path, "tests/fixtures/taew_%s.safetensors", name);
-    CHECK(dar_weights_open(&w, path, &e) == DAR_OK, "%s", e.text);
-    return w;
-}
-
-static dar_tensor stage(dar_weights *w, const char *name)
-{
-    dar_tensor x;
-    dar_err e;
-    CHECK(dar_weights_tensor(w, name, &x, &e) == DAR_OK, "%s", e.text);
-    return x;
-}
 
 static void declare(net *n, const dar_taew_config *c, dar_dtype storage)
 {
@@ -53,7 +36,7 @@ static void net_init(net *n, dar_dtype storage)
     CHECK(dar_arena_init(&n->step, "step", 64 << 20, &e) == DAR_OK, "%s", e.text);
     CHECK(dar_arena_init(&n->cache, "cache", 8 << 20, &e) == DAR_OK, "%s", e.text);
     declare(n, &small, storage);
-    n->file = open_fixture("weights");
+    n->file = fixture_open("taew_weights.safetensors");
     CHECK(dar_load_vae(&n->p, n->file, &e) == DAR_OK, "%s", e.text);
     dar_taew_prepare(&n->v, &n->weights);
 }
@@ -68,13 +51,6 @@ static void net_free(net *n)
     dar_arena_free(&n->cache);
 }
 
-static dar_val *input(net *n, const dar_tensor *x)
-{
-    dar_val *v = dar_input(&n->tape, n->p.main, x->shape);
-    dar_tensor_copy(&v->x, x);
-    return v;
-}
-
 /* ---------------------------------------------------------------- against the formulas */
 
 static void parity(void **state)
@@ -84,13 +60,15 @@ static void parity(void **state)
         dar_dtype type;
         double bound;
     } runs[] = { { DAR_F64, 1e-10 }, { DAR_F32, 2e-5 }, { DAR_BF16, 6e-2 } };
-    dar_weights *s = open_fixture("stages");
-    dar_tensor x = stage(s, "x"), latent = stage(s, "latent"), z = stage(s, "z"), pixels = stage(s, "pixels");
+    dar_weights *s = fixture_open("taew_stages.safetensors");
+    dar_tensor x = fixture_tensor(s, "x"), latent = fixture_tensor(s, "latent"), z = fixture_tensor(s, "z"),
+               pixels = fixture_tensor(s, "pixels");
     for (size_t i = 0; i < DAR_COUNT(runs); i++) {
         net n;
         net_init(&n, runs[i].type);
-        double d[] = { test_relative(&dar_taew_encode(&n.tape, &n.v, input(&n, &x))->x, &latent),
-                       test_relative(&dar_taew_decode(&n.tape, &n.v, input(&n, &z))->x, &pixels) };
+        double d[] = { test_relative(&dar_taew_encode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &x))->x, &latent),
+                       test_relative(&dar_taew_decode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &z))->x,
+                                     &pixels) };
         printf("%s: latent %.1e, pixels %.1e\n", dar_dtype_name(runs[i].type), d[0], d[1]);
         for (int k = 0; k < 2; k++) CHECK_NEAR(dar_dtype_name(runs[i].type), d[k], 0, runs[i].bound);
         net_free(&n);
@@ -132,13 +110,13 @@ static void decoding_in_pieces(void **state)
         net_init(&n, (dar_dtype)type);
         dar_tensor z = dar_tensor_push(&n.weights, n.p.main, DAR_SHAPE(1, 5, 4, 3, 2));
         dar_rng_fill_uniform(&z, 1, 2, -4, 4);
-        frames f = { .whole = &dar_taew_decode(&n.tape, &n.v, input(&n, &z))->x };
+        frames f = { .whole = &dar_taew_decode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &z))->x };
         assert_int_equal(f.whole->shape.d[2], 13);
         dar_taew_stream s;
         dar_taew_stream_init(&s, &n.v, DAR_VAE_DECODER, &n.cache);
         for (int64_t k = 0; k < 4; k++) {
             dar_tensor piece = dar_tensor_narrow(&z, 2, k, 1);
-            dar_val *in = input(&n, &piece);
+            dar_val *in = fixture_input(&n.tape, n.p.main, &piece);
             size_t used = n.step.used;
             assert_int_equal(dar_taew_decode_next(&s, &n.tape, in, compare, &f, NULL), DAR_OK);
             assert_int_equal(n.step.used, used);
@@ -157,13 +135,13 @@ static void encoding_in_pieces(void **state)
         net_init(&n, F % 2 ? DAR_F32 : DAR_F64);
         dar_tensor x = dar_tensor_push(&n.weights, n.p.main, DAR_SHAPE(1, 3, F, 48, 32));
         dar_rng_fill_uniform(&x, 1, 2, -1, 1);
-        dar_val *whole = dar_taew_encode(&n.tape, &n.v, input(&n, &x));
+        dar_val *whole = dar_taew_encode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &x));
         assert_int_equal(whole->x.shape.d[2], 3);
         dar_taew_stream s;
         dar_taew_stream_init(&s, &n.v, DAR_VAE_ENCODER, &n.cache);
         for (int64_t k = 0; k < 3; k++) {
             dar_tensor piece = dar_tensor_narrow(&x, 2, 4 * k, k < 2 ? 4 : F - 8);
-            same_frames(&whole->x, k, &dar_taew_encode_next(&s, &n.tape, input(&n, &piece))->x);
+            same_frames(&whole->x, k, &dar_taew_encode_next(&s, &n.tape, fixture_input(&n.tape, n.p.main, &piece))->x);
         }
         net_free(&n);
     }
@@ -173,15 +151,15 @@ static void same_bits(void **state)
 {
     (void)state;
     static const int threads[] = { 1, 2, 3, 7 };
-    dar_weights *s = open_fixture("stages");
-    dar_tensor z = stage(s, "z");
+    dar_weights *s = fixture_open("taew_stages.safetensors");
+    dar_tensor z = fixture_tensor(s, "z");
     int before = dar_threads();
     unsigned char *kept = NULL;
     for (int i = 0; i < 4; i++) {
         net n;
         dar_threads_set(threads[i]);
         net_init(&n, DAR_F32);
-        dar_val *y = dar_taew_decode(&n.tape, &n.v, input(&n, &z));
+        dar_val *y = dar_taew_decode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &z));
         size_t bytes = dar_tensor_bytes(&y->x);
         if (!kept) memcpy(kept = malloc(bytes), y->x.data, bytes);
         else assert_memory_equal(kept, y->x.data, bytes);

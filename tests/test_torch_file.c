@@ -1,42 +1,25 @@
 /* test_torch_file.c: what torch.save wrote is read; every kind of damage gives one line that names the file. */
-#include "tests/test.h"
+#include "tests/fixture.h"
 
 #include "lib/file.h"
 #include "lib/weights.h"
 
 /* ---------------------------------------------------------------- sound files */
 
-static dar_weights *open_fixture(const char *name)
-{
-    char path[128];
-    dar_weights *w;
-    dar_err e;
-    snprintf(path, sizeof path, "tests/fixtures/%s", name);
-    CHECK(dar_weights_open(&w, path, &e) == DAR_OK, "%s", e.text);
-    return w;
-}
-
-static double at(dar_weights *w, const char *name, size_t i)
-{
-    dar_tensor x;
-    dar_err e;
-    CHECK(dar_weights_tensor(w, name, &x, &e) == DAR_OK, "%s", e.text);
-    return dar_dtype_get(x.dtype, x.data, i);
-}
-
 static void both_containers(void **state)
 {
     (void)state;
     static const char *const names[] = { "torch_zip.pth", "torch_old.pth" };
     for (int k = 0; k < 2; k++) {
-        dar_weights *w = open_fixture(names[k]);
+        dar_weights *w = fixture_open(names[k]);
         assert_int_equal(dar_weights_count(w), 5);
         for (size_t i = 0; i < 6; i++) {
             double x = (double)i / 4 - 0.5;
-            CHECK_NEAR("f32", at(w, "f32", i), x, 0);
-            CHECK_NEAR("bf16", at(w, "bf16", i), x, 0);
-            CHECK_NEAR("tied", at(w, "tied", i), x, 0);
-            if (i >= 3) CHECK_NEAR("half", at(w, "half", i - 3), x, 0); /* a view that was made one by .half() */
+            CHECK_NEAR("f32", fixture_number(w, "f32", i), x, 0);
+            CHECK_NEAR("bf16", fixture_number(w, "bf16", i), x, 0);
+            CHECK_NEAR("tied", fixture_number(w, "tied", i), x, 0);
+            if (i >= 3)
+                CHECK_NEAR("half", fixture_number(w, "half", i - 3), x, 0); /* a view that was made one by .half() */
         }
         const dar_weight *steps = dar_weights_find(w, "steps"), *f32 = dar_weights_find(w, "f32");
         assert_string_equal(steps->type, "I64");
@@ -53,13 +36,13 @@ static void both_containers(void **state)
 static void inside_a_checkpoint(void **state)
 {
     (void)state;
-    dar_weights *w = open_fixture("torch_inner.pth");
+    dar_weights *w = fixture_open("torch_inner.pth");
     assert_int_equal(dar_weights_count(w), 7);
-    CHECK_NEAR("0.weight", at(w, "0.weight", 5), -2, 0);
-    CHECK_NEAR("1.running_var", at(w, "1.running_var", 1), 1.5, 0);
+    CHECK_NEAR("0.weight", fixture_number(w, "0.weight", 5), -2, 0);
+    CHECK_NEAR("1.running_var", fixture_number(w, "1.running_var", 1), 1.5, 0);
     dar_weights_close(w);
-    w = open_fixture("torch_parameter.pth");
-    CHECK_NEAR("p", at(w, "p", 5), 0.75, 0);
+    w = fixture_open("torch_parameter.pth");
+    CHECK_NEAR("p", fixture_number(w, "p", 5), 0.75, 0);
     dar_weights_close(w);
 }
 

@@ -4,6 +4,7 @@
 
 #include "lib/kern.h"
 #include "lib/rng.h"
+#include "tests/fixture.h"
 #include "tests/model.h"
 #include "train/optim.h"
 #include "train/step.h"
@@ -309,22 +310,6 @@ static void overfits(void **state)
 
 /* ---------------------------------------------------------------- PyTorch */
 
-static dar_weights *fixture(const char *name)
-{
-    dar_weights *w;
-    dar_err e;
-    CHECK(dar_weights_open(&w, name, &e) == DAR_OK, "%s", e.text);
-    return w;
-}
-
-static double number(dar_weights *w, const char *name, size_t i)
-{
-    dar_tensor x;
-    dar_err e;
-    CHECK(dar_weights_tensor(w, name, &x, &e) == DAR_OK, "%s", e.text);
-    return dar_dtype_get(x.dtype, x.data, i);
-}
-
 /* Largest distance of a trained parameter from the fixture's, over the largest of these; the worst of all. */
 static double distance_after(dar_weights *w, const dar_params *p)
 {
@@ -340,7 +325,7 @@ static double distance_after(dar_weights *w, const dar_params *p)
                      dar_projection_names[key.projection], key.part == DAR_LORA_DOWN ? 'A' : 'B');
         double most = 0, largest = 0;
         for (size_t k = 0; k < dar_tensor_count(&q->x); k++) {
-            double x = dar_dtype_get(q->x.dtype, q->x.data, k), y = number(w, name, k);
+            double x = dar_dtype_get(q->x.dtype, q->x.data, k), y = fixture_number(w, name, k);
             if (!(fabs(x - y) <= most)) most = fabs(x - y);
             largest = fmax(largest, fabs(y));
         }
@@ -355,9 +340,8 @@ static void against_torch(dar_dtype storage, double bound_loss, double bound_aft
     dar_train_config c = standard();
     dar_lora_read_options read = { .alpha = 1.5, .strength = 1 };
     dar_config preset = model_preset("dar-test");
-    dar_weights *lora = fixture("tests/fixtures/dit_lora.safetensors"),
-                *weights = fixture("tests/fixtures/dit_weights.safetensors"),
-                *expected = fixture("tests/fixtures/dit_train.safetensors");
+    dar_weights *lora = fixture_open("dit_lora.safetensors"), *weights = fixture_open("dit_weights.safetensors"),
+                *expected = fixture_open("dit_train.safetensors");
     dar_step_plan plan[DAR_RECOMPUTE_ALL + 1];
     dar_arena moments;
     dar_optim optim;
@@ -387,9 +371,9 @@ static void against_torch(dar_dtype storage, double bound_loss, double bound_aft
     double worst = 0;
     for (int k = 0; k < 10; k++) {
         double loss = dar_step_run(&step, &b, k, 0).loss, norm = dar_optim_step(&optim).norm;
-        worst = fmax(worst, fabs(loss / number(expected, "loss", (size_t)k) - 1));
-        CHECK_NEAR("loss", loss, number(expected, "loss", (size_t)k), bound_loss);
-        CHECK_NEAR("norm", norm, number(expected, "norm", (size_t)k), 10 * bound_loss);
+        worst = fmax(worst, fabs(loss / fixture_number(expected, "loss", (size_t)k) - 1));
+        CHECK_NEAR("loss", loss, fixture_number(expected, "loss", (size_t)k), bound_loss);
+        CHECK_NEAR("norm", norm, fixture_number(expected, "norm", (size_t)k), 10 * bound_loss);
     }
     double after = distance_after(expected, &o.p);
     printf("note: ten steps against PyTorch, %s: losses %.1e, parameters %.1e\n", dar_dtype_name(storage), worst,

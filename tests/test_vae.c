@@ -7,6 +7,7 @@
 #include "models/tiles.h"
 #include "models/vae.h"
 #include "tests/distance.h"
+#include "tests/fixture.h"
 
 typedef struct net {
     dar_config c;
@@ -15,24 +16,6 @@ typedef struct net {
     dar_vae v;
     dar_tape tape;
 } net;
-
-static dar_weights *open_fixture(const char *name)
-{
-    char path[128];
-    dar_weights *w;
-    dar_err e;
-    snprintf(path, sizeof path, "tests/fixtures/vae_%s.safetensors", name);
-    CHECK(dar_weights_open(&w, path, &e) == DAR_OK, "%s", e.text);
-    return w;
-}
-
-static dar_tensor stage(dar_weights *w, const char *name)
-{
-    dar_tensor x;
-    dar_err e;
-    CHECK(dar_weights_tensor(w, name, &x, &e) == DAR_OK, "%s", e.text);
-    return x;
-}
 
 /* The test preset with the fixture's weights, trainable or not. */
 static void net_init(net *n, dar_dtype storage, bool train)
@@ -48,11 +31,11 @@ static void net_init(net *n, dar_dtype storage, bool train)
     dar_vae_init(&n->v, &n->p, &n->c.vae);
     if (train) dar_params_train(&n->p, DAR_PARAM_ALL);
 
-    dar_weights *w = open_fixture("weights");
+    dar_weights *w = fixture_open("vae_weights.safetensors");
     assert_int_equal(dar_weights_count(w), n->p.count);
     for (size_t i = 0; i < n->p.count; i++) {
         dar_param *q = n->p.at[i];
-        dar_tensor x = stage(w, q->name);
+        dar_tensor x = fixture_tensor(w, q->name);
         dar_param_push(&n->p, q);
         dar_tensor_copy(&q->x, &x);
     }
@@ -69,13 +52,6 @@ static void net_free(net *n)
     dar_arena_free(&n->cache);
 }
 
-static dar_val *input(net *n, const dar_tensor *x)
-{
-    dar_val *v = dar_input(&n->tape, n->p.main, x->shape);
-    dar_tensor_copy(&v->x, x);
-    return v;
-}
-
 /* ---------------------------------------------------------------- against the reference */
 
 static void parity(void **state)
@@ -85,17 +61,18 @@ static void parity(void **state)
         dar_dtype type;
         double bound;
     } runs[] = { { DAR_F64, 1e-10 }, { DAR_F32, 2e-5 }, { DAR_BF16, 6e-2 } };
-    dar_weights *s = open_fixture("stages");
-    dar_tensor x = stage(s, "x"), moments = stage(s, "moments"), z = stage(s, "z"), pixels = stage(s, "pixels");
+    dar_weights *s = fixture_open("vae_stages.safetensors");
+    dar_tensor x = fixture_tensor(s, "x"), moments = fixture_tensor(s, "moments"), z = fixture_tensor(s, "z"),
+               pixels = fixture_tensor(s, "pixels");
     for (size_t i = 0; i < DAR_COUNT(runs); i++) {
         net n;
         net_init(&n, runs[i].type, false);
         n.tape.recording = false;
-        dar_val *m = dar_vae_encode(&n.tape, &n.v, input(&n, &x));
+        dar_val *m = dar_vae_encode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &x));
         dar_val *latent = dar_vae_normalise(&n.tape, &n.v, dar_vae_mean(&n.tape, &n.v, m));
-        dar_val *y = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        dar_val *y = dar_vae_decode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &z));
         dar_vae_fold(&n.v, &n.weights);
-        dar_val *folded = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        dar_val *folded = dar_vae_decode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &z));
         double d[] = { test_relative(&m->x, &moments), test_relative(&latent->x, &z), test_relative(&y->x, &pixels),
                        test_relative(&folded->x, &pixels) };
         printf("%s: moments %.1e, latent %.1e, pixels %.1e, folded %.1e\n", dar_dtype_name(runs[i].type), d[0], d[1],
@@ -120,19 +97,19 @@ static void gradients(void **state)
         dar_dtype type;
         double bound;
     } runs[] = { { DAR_F64, 1e-9 }, { DAR_F32, 1e-4 } };
-    dar_weights *s = open_fixture("stages");
-    dar_tensor x = stage(s, "x"), loss = stage(s, "loss");
+    dar_weights *s = fixture_open("vae_stages.safetensors");
+    dar_tensor x = fixture_tensor(s, "x"), loss = fixture_tensor(s, "loss");
     for (size_t i = 0; i < DAR_COUNT(runs); i++) {
         net n;
         net_init(&n, runs[i].type, true);
-        dar_val *found = round_trip(&n, input(&n, &x));
+        dar_val *found = round_trip(&n, fixture_input(&n.tape, n.p.main, &x));
         CHECK_NEAR("loss", dar_dtype_get(n.p.main, found->x.data, 0), *(const double *)loss.data, runs[i].bound);
         dar_backward(&n.tape, found, NULL);
         double worst = 0;
         for (size_t k = 0; k < n.p.count; k++) {
             char name[128];
             snprintf(name, sizeof name, "grad.%s", n.p.at[k]->name);
-            dar_tensor g = stage(s, name);
+            dar_tensor g = fixture_tensor(s, name);
             double d = test_relative(&n.p.at[k]->g, &g);
             CHECK(d <= runs[i].bound, "%s: %.2e", name, d);
             worst = fmax(worst, d);
@@ -168,21 +145,21 @@ static dar_status compare(void *ctx, const dar_tensor *frame, int64_t index, dar
 static void decoding_in_pieces(void **state)
 {
     (void)state;
-    dar_weights *s = open_fixture("stages");
-    dar_tensor z = stage(s, "z");
+    dar_weights *s = fixture_open("vae_stages.safetensors");
+    dar_tensor z = fixture_tensor(s, "z");
     for (int type = DAR_F64; type <= DAR_BF16; type++) {
         net n;
         net_init(&n, (dar_dtype)type, false);
         dar_vae_fold(&n.v, &n.weights);
         n.tape.recording = false;
-        dar_val *whole = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        dar_val *whole = dar_vae_decode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &z));
         frames f = { .whole = &whole->x };
         dar_vae_stream stream;
         dar_vae_stream_init(&stream, &n.v, DAR_VAE_DECODER, &n.cache);
         for (int64_t k = 0; k < z.shape.d[2]; k++) {
             dar_tensor piece = dar_tensor_narrow(&z, 2, k, 1);
             size_t used = n.step.used;
-            dar_val *in = input(&n, &piece);
+            dar_val *in = fixture_input(&n.tape, n.p.main, &piece);
             size_t with = n.step.used;
             assert_int_equal(dar_vae_decode_next(&stream, &n.tape, in, compare, &f, NULL), DAR_OK);
             assert_int_equal(n.step.used, with);
@@ -197,7 +174,7 @@ static void decoding_in_pieces(void **state)
 /* Encode a clip of F frames in pieces; every latent frame has the bits of the whole.  Returns the parts skipped. */
 static int64_t encode_in_pieces(net *n, const dar_tensor *x, bool skip)
 {
-    dar_val *whole = dar_vae_encode(&n->tape, &n->v, input(n, x));
+    dar_val *whole = dar_vae_encode(&n->tape, &n->v, fixture_input(&n->tape, n->p.main, x));
     dar_vae_stream s;
     dar_mark cache = dar_arena_mark(&n->cache);
     dar_vae_stream_init(&s, &n->v, DAR_VAE_ENCODER, &n->cache);
@@ -207,7 +184,7 @@ static int64_t encode_in_pieces(net *n, const dar_tensor *x, bool skip)
         int64_t count = k ? step : 1;
         dar_tensor piece = dar_tensor_narrow(x, 2, at, count), expected = dar_tensor_narrow(&whole->x, 2, k, 1);
         dar_mark m = dar_arena_mark(&n->step);
-        dar_val *in = input(n, &piece), *y = dar_vae_encode_next(&s, &n->tape, in);
+        dar_val *in = fixture_input(&n->tape, n->p.main, &piece), *y = dar_vae_encode_next(&s, &n->tape, in);
         dar_tensor same = dar_tensor_push(&n->step, expected.dtype, expected.shape);
         dar_tensor_copy(&same, &expected);
         assert_memory_equal(y->x.data, same.data, dar_tensor_bytes(&same));
@@ -251,10 +228,10 @@ static void causality(void **state)
     n.tape.recording = false;
     dar_tensor x = dar_tensor_push(&n.weights, DAR_F32, DAR_SHAPE(1, 3, 9, 16, 16));
     dar_rng_fill_uniform(&x, 1, 2, -1, 1);
-    dar_val *before = dar_vae_encode(&n.tape, &n.v, input(&n, &x));
+    dar_val *before = dar_vae_encode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &x));
     dar_tensor frame = dar_tensor_narrow(&x, 2, 5, 1);
     dar_tensor_fill(&frame, 0.5);
-    dar_val *after = dar_vae_encode(&n.tape, &n.v, input(&n, &x));
+    dar_val *after = dar_vae_encode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &x));
     const float *a = before->x.data, *b = after->x.data;
     int64_t C = before->x.shape.d[1];
     for (int64_t c = 0; c < C; c++) {
@@ -267,8 +244,8 @@ static void causality(void **state)
 static void same_bits(void **state)
 {
     (void)state;
-    dar_weights *s = open_fixture("stages");
-    dar_tensor z = stage(s, "z");
+    dar_weights *s = fixture_open("vae_stages.safetensors");
+    dar_tensor z = fixture_tensor(s, "z");
     int before = dar_threads();
     static const int threads[] = { 1, 2, 3, 7 };
     unsigned char *kept = NULL;
@@ -277,7 +254,7 @@ static void same_bits(void **state)
         dar_threads_set(threads[i]);
         net_init(&n, DAR_F32, false);
         n.tape.recording = false;
-        dar_val *y = dar_vae_decode(&n.tape, &n.v, input(&n, &z));
+        dar_val *y = dar_vae_decode(&n.tape, &n.v, fixture_input(&n.tape, n.p.main, &z));
         size_t bytes = dar_tensor_bytes(&y->x);
         if (!kept) memcpy(kept = malloc(bytes), y->x.data, bytes);
         else assert_memory_equal(kept, y->x.data, bytes);
@@ -347,8 +324,8 @@ static void run_tiles(net *n, const dar_tiling *o, dar_tensor *moments, dar_tens
         dar_tiles_decode(&n->tape, &n->v, o, &z, pixels, &n->cache);
         assert_int_equal(n->step.used + n->cache.used + n->tape.meta.used, 0);
     } else {
-        dar_tensor_copy(moments, &dar_vae_encode(&n->tape, &n->v, input(n, &x))->x);
-        dar_tensor_copy(pixels, &dar_vae_decode(&n->tape, &n->v, input(n, &z))->x);
+        dar_tensor_copy(moments, &dar_vae_encode(&n->tape, &n->v, fixture_input(&n->tape, n->p.main, &x))->x);
+        dar_tensor_copy(pixels, &dar_vae_decode(&n->tape, &n->v, fixture_input(&n->tape, n->p.main, &z))->x);
         dar_vae_clamp(pixels);
         dar_tape_clear(&n->tape);
         dar_arena_reset(&n->step, 0);

@@ -89,12 +89,7 @@ static void backward(const dar_opctx *c)
     struct slope s = { *(const double *)c->attr, b.factor * dar_dtype_get(c->gy.dtype, c->gy.data, 0) };
     b.fn = slope_row;
     b.arg = &s;
-    for (int i = 0; i < 2; i++, s.factor = -s.factor) {
-        if (!c->gx[i].data) continue;
-        b.y = &c->gx[i];
-        b.add = c->add[i];
-        dar_bcast_map(&b);
-    }
+    dar_bcast_opposites(b, &s.factor, c->gx, c->add);
 }
 
 static const double soft = 0.3, sharp = 0.01, flat = 10, none = 0;

@@ -232,12 +232,7 @@ static void error_backward(const dar_opctx *c)
     double slope = 2 * b.factor * dar_dtype_get(c->gy.dtype, c->gy.data, 0);
     b.fn = slope_row;
     b.arg = &slope;
-    for (int i = 0; i < 2; i++, slope = -slope) {
-        if (!c->gx[i].data) continue;
-        b.y = &c->gx[i];
-        b.add = c->add[i];
-        dar_bcast_map(&b);
-    }
+    dar_bcast_opposites(b, &slope, c->gx, c->add);
 }
 
 static const bool mean = true, total = false;
