@@ -235,7 +235,20 @@ static void make_task(void *ctx, size_t i, int thread)
     note(j, &a.times, s, &e);
 }
 
-/* With fewer bundles than threads all threads make one. */
+/* Every thread makes a bundle at a time, and waits for its encoder and for the disk meanwhile: for every eight there is
+ * one more.  With fewer bundles than threads all threads make one. */
+static void make_missing(struct job *j)
+{
+    const int threads = dar_threads();
+    if (j->todo < (size_t)threads) {
+        for (size_t i = 0; i < j->todo; i++) make_task(j, i, 0);
+        return;
+    }
+    if (threads > 1) dar_threads_set(threads + (threads + 7) / 8);
+    dar_parallel(j->todo, make_task, j);
+    dar_threads_set(threads);
+}
+
 static dar_status make_all(struct job *j, dar_err *e)
 {
     char path[PATH_MAX];
@@ -243,9 +256,7 @@ static dar_status make_all(struct job *j, dar_err *e)
     DAR_TRY(dar_dir_create(&j->making, path, e));
     j->e = e;
     j->progress = dar_progress_begin("synth", "bundles", (double)j->todo);
-    if (j->todo >= (size_t)dar_threads()) dar_parallel(j->todo, make_task, j);
-    else
-        for (size_t i = 0; i < j->todo; i++) make_task(j, i, 0);
+    make_missing(j);
     if (dar_interrupted())
         return dar_fail(e, DAR_ERR_INTERRUPTED, "%s: interrupted after %zu of %zu bundles; the same command goes on",
                         o.out, j->count - j->todo + j->made, j->count);

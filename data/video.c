@@ -19,7 +19,8 @@
 
 extern char **environ;
 
-#define WORDS 200 /* bytes of a child's last line that are kept */
+#define WORDS 200         /* bytes of a child's last line that are kept */
+#define SMALL (256 * 256) /* [px] of pictures for which threads are not worth their start */
 
 /* A running program, its input or output in `fd`, what it says on standard error in `said`. */
 struct child {
@@ -213,12 +214,14 @@ static dar_status encode(dar_video *v, size_t width, size_t height, const dar_vi
                                           "tv",
                                           "-movflags",
                                           "+faststart" };
+    static const char *const alone[] = { "-threads", "1", "-filter_threads", "1" };
     size_t n = 21;
     DAR_TRY(as_file(to, sizeof to, v->out.temp, e));
     DAR_TRY(tag(&comment, v->path, "comment", how->comment, e));
     snprintf(size, sizeof size, "%zux%zu", width, height);
     snprintf(rate, sizeof rate, "%.6f", how->fps);
     for (size_t i = 0; i < DAR_COUNT(colour) && for_people(codec); i++) argv[n++] = colour[i];
+    for (size_t i = 0; i < DAR_COUNT(alone) && width * height <= SMALL; i++) argv[n++] = alone[i];
     if (comment) {
         argv[n++] = "-metadata";
         argv[n++] = comment;
