@@ -19,7 +19,7 @@
 static struct {
     const char *out, *model, *weights, *part[DAR_MODEL_PARTS], *channels, *noise, *text, *negative;
     int64_t steps;
-    double guidance, shift, strength;
+    double guidance, shift, strength, tolerance;
     int solver, grid, precision, skip;
     int64_t window, overlap;
     dar_arg_list references, no_skip;
@@ -79,6 +79,9 @@ static const dar_option options[] = {
     { .name = "grid", .placeholder = "NAME", .type = DAR_ARG_CHOICE, .target = &o.grid, .standard = "auto",
       .names = grid_names, .help = "even, twice, whole or diffusers (models/flow.h); auto: what the solver is "
       "published on" },
+    { .name = "tolerance", .placeholder = "T", .type = DAR_ARG_NUMBER, .target = &o.tolerance, .standard = "0",
+      .lo = 0, .hi = 1, .help = "leave out steps that earlier ones foretell: each may be off by T of the latent "
+      "(models/solver.h); 0: none" },
     { .name = "noise", .placeholder = "own|torch|FILE", .type = DAR_ARG_TEXT, .target = &o.noise, .standard = "own",
       .help = "drawn by --seed as this program does, or as torch.randn on a CPU; or a safetensors file" },
     { .name = "text", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.text,
@@ -166,6 +169,7 @@ static dar_status read_options(struct job *j, dar_err *e)
     p->sampler.solver.grid = o.grid == DAR_GRIDS ? dar_solver_grid(p->sampler.solver.kind) : (dar_flow_grid)o.grid;
     p->sampler.solver.steps = (size_t)o.steps;
     p->sampler.solver.shift = o.shift;
+    p->sampler.solver.tolerance = o.tolerance;
     if (strcmp(o.noise, "torch") == 0) p->noise = DAR_NOISE_TORCH;
     else if (strcmp(o.noise, "own") != 0) p->noise_file = o.noise;
     DAR_TRY(read_window(p, e));
@@ -305,6 +309,7 @@ static void print_sampler(dar_json_writer *w, const struct job *j)
     dar_json_write_number(w, "guidance", c->guidance);
     dar_json_write_number(w, "shift", c->solver.shift);
     dar_json_write_text(w, "solver", dar_solver_name[c->solver.kind]);
+    if (c->solver.tolerance > 0) dar_json_write_number(w, "tolerance", c->solver.tolerance);
     dar_json_write_text(w, "grid", dar_flow_grid_name[c->solver.grid]);
     dar_json_write_text(w, "noise", j->how.noise_file ? "file" : o.noise);
     if (!j->how.noise_file) {
@@ -415,9 +420,13 @@ static void tell_video(struct job *j, const dar_pipeline *p, const struct hearin
                  decode = h->ended[2] - h->ended[1];
     const dar_bundle_meta *m = &p->b->meta;
     char time[32];
+    const dar_sampler *ran = &p->sampler;
     dar_run_say(j->r, "%s: %zu frames of %d x %d in %s: encoding %.2f s, %zu steps %.2f s, decoding %.2f s", h->path,
                 m->frames, m->width, m->height, dar_log_duration(encode + sample + decode, time, sizeof time), encode,
-                p->o.sampler.solver.steps, sample, decode);
+                ran->steps, sample, decode);
+    dar_json_write_int(&j->r->json, "steps", (int64_t)ran->steps);
+    dar_json_write_int(&j->r->json, "steps_rejected", (int64_t)ran->rejected);
+    dar_json_write_number(&j->r->json, "estimated_error", ran->estimate);
     dar_json_write_object(&j->r->json, "seconds");
     dar_json_write_number(&j->r->json, "encode", encode);
     dar_json_write_number(&j->r->json, "sample", sample);

@@ -83,23 +83,41 @@ typedef struct combination {
     const dar_tensor *y;
 } combination;
 
+/* Elements i .. i + n - 1, n at most DAR_PIECE. */
+static void combine_piece(const combination *c, size_t i, size_t n, double *buf)
+{
+    const dar_kern *k = dar_kern_for(c->x[0]->dtype);
+    k->scale(n, c->a[0], dar_tensor_at(c->x[0], i), buf);
+    for (int j = 1; j < c->n; j++) k->axpy(n, c->a[j], dar_tensor_at(c->x[j], i), buf);
+}
+
 static void combine_range(void *ctx, size_t begin, size_t end, int thread)
 {
     const combination *c = ctx;
     dar_dtype type = c->y->dtype;
-    const dar_kern *k = dar_kern_for(type);
     double buf[DAR_PIECE];
     (void)thread;
 
     for (size_t i = begin; i < end; i += DAR_PIECE) {
         size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
-        k->scale(n, c->a[0], dar_tensor_at(c->x[0], i), buf);
-        for (int j = 1; j < c->n; j++) k->axpy(n, c->a[j], dar_tensor_at(c->x[j], i), buf);
+        combine_piece(c, i, n, buf);
         dar_row_convert(type, dar_tensor_at(c->y, i), type, buf, n);
     }
 }
 
-void dar_flow_combine(int n, const double *a, const dar_tensor *const *x, const dar_tensor *y)
+static double square_range(void *ctx, size_t begin, size_t end)
+{
+    const combination *c = ctx;
+    double buf[DAR_PIECE], sum = 0;
+    for (size_t i = begin; i < end; i += DAR_PIECE) {
+        size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
+        combine_piece(c, i, n, buf);
+        sum += dar_kern_for(c->x[0]->dtype)->dot(n, buf, buf);
+    }
+    return sum;
+}
+
+static void check_terms(int n, const dar_tensor *const *x, const dar_tensor *y)
 {
     DAR_ASSERT(n >= 1 && n <= MOST, "flow: %d terms, expected 1 to %d", n, MOST);
     DAR_ASSERT(y->dtype == DAR_F32 || y->dtype == DAR_F64, "flow: type %s, expected f32 or f64",
@@ -108,9 +126,20 @@ void dar_flow_combine(int n, const double *a, const dar_tensor *const *x, const 
         DAR_ASSERT(x[j]->dtype == y->dtype && dar_shape_equal(&x[j]->shape, &y->shape) && dar_tensor_contiguous(x[j]),
                    "flow: term %d has another type or shape than the result, or is a strided view", j);
     DAR_ASSERT(dar_tensor_contiguous(y), "flow: the result is a strided view");
+}
 
+void dar_flow_combine(int n, const double *a, const dar_tensor *const *x, const dar_tensor *y)
+{
+    check_terms(n, x, y);
     combination c = { n, a, x, y };
     dar_parallel_range(dar_tensor_count(y), 16 * DAR_PIECE, combine_range, &c);
+}
+
+double dar_flow_norm(int n, const double *a, const dar_tensor *const *x)
+{
+    check_terms(n, x, x[0]);
+    combination c = { n, a, x, NULL };
+    return sqrt(dar_parallel_sum(dar_tensor_count(x[0]), 16 * DAR_PIECE, square_range, &c));
 }
 
 void dar_flow_mix(const dar_tensor *z0, const dar_tensor *eps, double sigma, const dar_tensor *z)

@@ -55,6 +55,9 @@ void dar_flow_target(const dar_tensor *z0, const dar_tensor *eps, const dar_tens
  * x. */
 void dar_flow_combine(int n, const double *a, const dar_tensor *const *x, const dar_tensor *y);
 
+/* The Euclidean norm of such a combination, the same bits for any number of threads. */
+double dar_flow_norm(int n, const double *a, const dar_tensor *const *x);
+
 /* ---------------------------------------------------------------- grids of sigmas for sampling */
 
 typedef enum dar_flow_grid {

@@ -288,6 +288,13 @@ static dar_status check_finite(const dar_solver *solver, const dar_tensor *v, da
                     solver->step + 1, solver->steps, solver->sigma[solver->step], (long long)i);
 }
 
+/* Of a first frame that is held nothing changes. */
+static void hold_still(const dar_tensor *v)
+{
+    dar_tensor first = dar_tensor_narrow(v, 2, 0, 1);
+    dar_tensor_fill(&first, 0);
+}
+
 static dar_status run_steps(dar_sampler *s, struct run *r, const dar_tensor *first, const dar_tensor *z,
                             dar_sampler_told *told, void *ctx, dar_err *e)
 {
@@ -296,19 +303,24 @@ static dar_status run_steps(dar_sampler *s, struct run *r, const dar_tensor *fir
     dar_solver solver;
     dar_solver_init(&solver, &s->c.solver, z, s->kept.arena);
     if (first && !plans(s)) dar_dit_hold_first(z, first);
-    for (size_t i = 0; i < solver.steps; i++) {
-        write_times(s, r, plans(s) ? 0 : solver.time[i]);
+    for (size_t i = 0; i < solver.steps && plans(s); i++) {
+        write_times(s, r, 0);
         call_all(s, r, z);
-        if (plans(s)) continue;
+    }
+    while (solver.step < solver.steps && !plans(s)) {
+        const double to_clean[] = { 1, -solver.sigma[solver.step] };
+        write_times(s, r, solver.time[solver.step]);
+        call_all(s, r, z);
         if (s->twice) dar_flow_combine(2, weight, (const dar_tensor *const[]){ v, u }, v);
         DAR_TRY(check_finite(&solver, v, e));
-        const double to_clean[] = { 1, -solver.sigma[i] };
+        if (first) hold_still(v);
         if (told) dar_flow_combine(2, to_clean, (const dar_tensor *const[]){ z, v }, &r->clean);
         if (told && first) dar_dit_hold_first(&r->clean, first);
         dar_solver_step(&solver, v, z);
         if (first) dar_dit_hold_first(z, first);
         if (told) DAR_TRY(told(ctx, solver.step, z, &r->clean, e));
     }
+    s->steps = solver.calls, s->rejected = solver.rejected, s->estimate = solver.estimate;
     return DAR_OK;
 }
 

@@ -76,6 +76,10 @@ typedef struct dar_sampler {
     size_t calls;    /* of the network, so far */
     int64_t windows; /* 1: there is one, of the whole clip */
 
+    /* Of the last run (models/solver.h): steps that were called, of them taken back, estimated error. */
+    size_t steps, rejected;
+    double estimate;
+
     /* Of the sampler itself. */
     dar_tape kept, step;
     dar_dit_scene *scene; /* [windows] */
@@ -88,8 +92,9 @@ dar_status dar_sampler_init(dar_sampler *s, const dar_dit *m, const dar_sampler_
                             dar_arena *kept, dar_arena *step, dar_err *e);
 void dar_sampler_free(dar_sampler *s); /* accepts a zeroed one; the arenas are the caller's */
 
-/* After each step: how many are done, the latent as it is, and where the step saw it go: z - sigma v.  Anything but
- * DAR_OK ends the run. */
+/* After each call of the solver's: how many of its steps are done (with a tolerance, several at a time, and fewer where
+ * some are taken back), the latent as it is, and where the call saw it go: z - sigma v.  Anything but DAR_OK ends the
+ * run. */
 typedef dar_status dar_sampler_told(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e);
 
 /* z [1, latent, F, h, w] of the main type: noise becomes the latent.

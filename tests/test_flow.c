@@ -251,13 +251,134 @@ static void test_orders(void **state)
     }
 }
 
+/* ---------------------------------------------------------------- a tolerance */
+
+#define POINTS  2000
+#define STARTS  5
+#define HARDEST 1e-7
+
+typedef double field(double sigma, double z);
+
+static double normal_flow(double sigma, double z)
+{
+    return -mu + (sigma - (1 - sigma) * tau * tau) / variance(sigma) * (z - (1 - sigma) * mu);
+}
+
+/* The same until it turns, within four points of the grid. */
+static double turning_flow(double sigma, double z)
+{
+    return normal_flow(sigma, z) + 2 * tanh((0.5 - sigma) * POINTS);
+}
+
+/* Nothing foretells this. */
+static double rough_flow(double sigma, double z)
+{
+    return normal_flow(sigma, z) + sin(1e6 * sigma);
+}
+
+struct ride {
+    dar_solver s;
+    double end[STARTS];
+};
+
+/* Of several starts at once, so that the norm of z stays away from 0. */
+static struct ride ride(dar_solver_kind kind, double tolerance, size_t steps, field *f)
+{
+    struct ride r;
+    dar_mark m = dar_arena_mark(&memory);
+    dar_tensor z = vector(STARTS), v = vector(STARTS);
+    double *at = z.data, *say = v.data;
+    dar_solver_config c = { .kind = kind, .grid = DAR_GRID_EVEN, .steps = steps, .shift = 1, .tolerance = tolerance };
+    dar_solver_init(&r.s, &c, &z, &memory);
+    for (size_t i = 0; i <= steps; i++) r.s.sigma[i] = 0.95 - 0.9 * (double)i / (double)steps;
+    for (int k = 0; k < STARTS; k++) at[k] = 0.95 * (k - 2) + 0.1;
+    while (r.s.step < r.s.steps) {
+        for (int k = 0; k < STARTS; k++) say[k] = f(r.s.sigma[r.s.step], at[k]);
+        dar_solver_step(&r.s, &v, &z);
+    }
+    memcpy(r.end, at, sizeof r.end);
+    dar_arena_reset(&memory, m);
+    return r;
+}
+
+/* In the Euclidean norm, relative. */
+static double apart(const double *x, const double *y)
+{
+    double d = 0, all = 0;
+    for (int k = 0; k < STARTS; k++) d += (x[k] - y[k]) * (x[k] - y[k]), all += y[k] * y[k];
+    return sqrt(d / all);
+}
+
+/* The error falls with the tolerance, decade by decade, until every point is called.  What the order below differs by
+ * is h^2 (euler: h^3), at most T, of which the step itself is off by a part of order h; steps are as many as 1 / h; so
+ * all of them are off by a few T.  And what is told is no less: it is the error of the order below.  Euler follows its
+ * plain run, which is compared with; so do the others, which are then near the ODE. */
+static void test_tolerance(void **state)
+{
+    (void)state;
+    for (int i = 0; i < DAR_SOLVERS; i++) {
+        dar_solver_kind k = (dar_solver_kind)i;
+        struct ride plain = ride(k, 0, POINTS, normal_flow);
+        size_t before = 0;
+        double largest = 0;
+        assert_int_equal(plain.s.calls, POINTS);
+        for (double T = 1e-2; T >= HARDEST; T /= 10) {
+            struct ride r = ride(k, T, POINTS, normal_flow);
+            double off = apart(r.end, plain.end);
+            printf("%s, tolerance %.0e: %zu calls, error %.1e, estimate %.1e\n", dar_solver_name[k], T, r.s.calls, off,
+                   r.s.estimate);
+            CHECK(off <= 3 * T, "%s: %g is more than 3 times the tolerance %g", dar_solver_name[k], off, T);
+            CHECK(off <= r.s.estimate, "%s: %g is more than was estimated, %g", dar_solver_name[k], off, r.s.estimate);
+            CHECK(r.s.calls > before, "%s: %zu calls at %g", dar_solver_name[k], r.s.calls, T);
+            before = r.s.calls;
+            largest = fmax(largest, off / T);
+        }
+        CHECK(largest > 1e-3, "%s: the error does not depend on the tolerance", dar_solver_name[k]);
+    }
+}
+
+/* No tolerance to speak of: the plain run, to the bit. */
+static void test_tolerance_of_nothing(void **state)
+{
+    (void)state;
+    for (int i = 0; i < DAR_SOLVERS; i++) {
+        struct ride plain = ride((dar_solver_kind)i, 0, 40, normal_flow);
+        struct ride r = ride((dar_solver_kind)i, 1e-300, 40, normal_flow);
+        assert_int_equal(r.s.calls, 40);
+        assert_memory_equal(r.end, plain.end, sizeof r.end);
+    }
+}
+
+/* Where the flow turns, steps are taken back: without that the error is 0.05.  Where nothing can be foretold, a run
+ * costs no more calls than the plain one. */
+static void test_guard(void **state)
+{
+    (void)state;
+    static const dar_solver_kind guarded[] = { DAR_EULER, DAR_UNIPC };
+    for (int i = 0; i < 2; i++) {
+        dar_solver_kind k = guarded[i];
+        struct ride plain = ride(k, 0, POINTS, turning_flow), r = ride(k, 1e-4, POINTS, turning_flow);
+        double off = apart(r.end, plain.end);
+        printf("%s: %zu calls, %zu taken back, error %.1e\n", dar_solver_name[k], r.s.calls, r.s.rejected, off);
+        CHECK(r.s.rejected > 0 && r.s.calls < POINTS / 4, "%s: nothing is taken back", dar_solver_name[k]);
+        CHECK(off <= 1e-3, "%s: %g", dar_solver_name[k], off);
+    }
+    for (int i = 0; i < DAR_SOLVERS; i++)
+        for (double T = 1; T > 1e-6; T /= 7) {
+            struct ride r = ride((dar_solver_kind)i, T, 60, rough_flow);
+            CHECK(r.s.calls <= 60, "%s: %zu calls of 60", dar_solver_name[i], r.s.calls);
+        }
+}
+
 /* A planning arena counts what a real one is asked for; f32 follows f64. */
 static void test_memory_and_types(void **state)
 {
     (void)state;
-    for (int k = 0; k < DAR_SOLVERS; k++) {
+    for (int i = 0; i < 2 * DAR_SOLVERS; i++) {
         dar_solver_config c = dar_solver_default();
+        int k = i % DAR_SOLVERS;
         c.kind = (dar_solver_kind)k, c.steps = 6;
+        c.tolerance = i < DAR_SOLVERS ? 0 : 1e-2;
         c.grid = dar_solver_grid(c.kind);
         dar_arena plan;
         assert_int_equal(dar_arena_init_plan(&plan, "plan", NULL), DAR_OK);
@@ -311,6 +432,9 @@ int main(void)
         cmocka_unit_test(test_grids),
         cmocka_unit_test(test_references),
         cmocka_unit_test(test_orders),
+        cmocka_unit_test(test_tolerance),
+        cmocka_unit_test(test_tolerance_of_nothing),
+        cmocka_unit_test(test_guard),
         cmocka_unit_test(test_memory_and_types),
         cmocka_unit_test(test_one_step_too_many),
     };

@@ -69,13 +69,15 @@ static void drop(struct bench *b)
 struct walk {
     dar_weights *steps; /* NULL: nobody compares */
     size_t seen, stop;  /* stop after so many; 0: never */
+    bool jumps;         /* steps may be left out */
     double worst;
 };
 
 static dar_status look(void *ctx, size_t done, const dar_tensor *z, const dar_tensor *clean, dar_err *e)
 {
     struct walk *w = ctx;
-    assert_int_equal(done, ++w->seen);
+    w->seen = w->jumps ? done : w->seen + 1;
+    assert_int_equal(done, w->seen);
     if (w->steps) {
         char name[16];
         dar_tensor y;
@@ -361,6 +363,41 @@ static void any_threads(void **state)
     dar_threads_set(threads);
 }
 
+/* With a tolerance: fewer calls, the same bits for any number of threads and with any skip left off that is exact, the
+ * plain run where it is nothing. */
+static void tolerance(void **state)
+{
+    (void)state;
+    int threads = dar_threads();
+    for (int k = 0; k < DAR_SOLVERS; k++) {
+        struct bench b;
+        struct walk w = { .jumps = true };
+        dar_tensor z[3];
+        size_t calls;
+        init(&b, DAR_F32);
+        b.c.solver.kind = (dar_solver_kind)k, b.c.solver.steps = 20;
+        b.c.solver.grid = dar_solver_grid(b.c.solver.kind);
+        dar_tensor plain = sample(&b, &w, NULL);
+        b.c.solver.tolerance = 1e-300;
+        z[0] = sample(&b, &w, &calls);
+        same_bits(&z[0], &plain);
+        assert_int_equal(calls, 40);
+        b.c.solver.tolerance = 3e-2;
+        for (int n = 0; n < 3; n++) {
+            dar_threads_set(n + 1);
+            z[n] = sample(&b, &w, &calls);
+            same_bits(&z[n], &z[0]);
+            assert_int_equal(w.seen, 20);
+        }
+        double off = test_relative(&z[0], &plain);
+        printf("sampler: %s with a tolerance: %zu calls, %.2g from the plain run\n", dar_solver_name[k], calls, off);
+        CHECK(calls < 40, "%s: %zu calls", dar_solver_name[k], calls);
+        CHECK(off > 0 && off <= 3 * b.c.solver.tolerance, "%s: %g from the plain run", dar_solver_name[k], off);
+        drop(&b);
+    }
+    dar_threads_set(threads);
+}
+
 /* One preparation, several runs: each as if alone.  A run that was stopped leaves nothing behind. */
 static void prepared_once(void **state)
 {
@@ -393,14 +430,15 @@ static void prepared_once(void **state)
 static void plan_is_what_is_taken(void **state)
 {
     (void)state;
-    for (int k = 0; k < DAR_SOLVERS; k++) {
+    for (int k = 0; k < 2 * DAR_SOLVERS; k++) {
         struct bench b;
-        struct walk w = { 0 };
+        struct walk w = { .jumps = true };
         dar_arena kept, step;
         dar_sampler s;
         dar_err e;
         init(&b, DAR_F32);
-        b.c.solver.kind = (dar_solver_kind)k;
+        b.c.solver.kind = (dar_solver_kind)(k % DAR_SOLVERS);
+        b.c.solver.tolerance = k < DAR_SOLVERS ? 0 : 0.1;
         b.c.solver.grid = dar_solver_grid(b.c.solver.kind);
         b.kept.peak = b.o.step.peak = 0;
         sample(&b, &w, NULL);
@@ -471,6 +509,7 @@ int main(void)
         cmocka_unit_test(no_seam),
         cmocka_unit_test(equal_prompts_are_one),
         cmocka_unit_test(any_threads),
+        cmocka_unit_test(tolerance),
         cmocka_unit_test(prepared_once),
         cmocka_unit_test(plan_is_what_is_taken),
         cmocka_unit_test(numbers_must_be_finite),
