@@ -1,6 +1,7 @@
 /* thread.c: the only place that starts threads. */
 #include "lib/thread.h"
 
+#include <limits.h>
 #include <omp.h>
 #include <stdlib.h>
 #include <unistd.h>
@@ -33,7 +34,11 @@ void dar_threads_restart(char *const argv[])
     static const char *const said[] = { "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_PROC_BIND", "OMP_PLACES" };
     for (size_t i = 0; i < DAR_COUNT(said); i++) /* bound to a processor, we would hand on that one alone */
         if (getenv(said[i])) return;
-    if (setenv("GOMP_SPINCOUNT", SPINS, 1) == 0) execv("/proc/self/exe", argv);
+    char path[PATH_MAX]; /* by its own path, which is what lists of processes then say */
+    ssize_t n = readlink("/proc/self/exe", path, sizeof path - 1);
+    if (n < 0 || setenv("GOMP_SPINCOUNT", SPINS, 1) != 0) return;
+    path[n] = 0;
+    execv(path, argv);
 }
 
 bool dar_in_task(void)

@@ -34,8 +34,7 @@ def torch_case(dtype, compiled, batched):
 
     torch.set_num_threads(THREADS)
     torch.manual_seed(0)
-    with open("models/presets/dar-tiny.json") as f:
-        c = json.loads("".join(line for line in f if not line.lstrip().startswith("//")))
+    c = torch_dit.preset("dar-tiny")
     d, a = c["dit"], c["adapter"]
     D, r, patch = d["width"], a["unshuffle"], d["patch"]
     frames, H, W = 5, 128, 224

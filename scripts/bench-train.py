@@ -17,9 +17,7 @@ import sys
 import time
 
 WAYS = ("none", "cheap")
-BATCH, FRAMES, ROWS, COLUMNS, LATENT, CHANNELS, R = 4, 5, 8, 14, 24, 33, 8
-LAYERS, D, HEADS, FFN, TEXT, WORDS, RANK = 8, 192, 6, 768, 64, 16, 32
-TOKENS = FRAMES * ROWS * COLUMNS
+BATCH, FRAMES, HEIGHT, WIDTH, RANK = 4, 5, 128, 224, 32  # latent frames, pixels
 THREADS = os.cpu_count()
 
 
@@ -37,28 +35,35 @@ def torch_step(dtype):
     torch.set_num_threads(THREADS)
     torch.manual_seed(0)
     storage = {"f32": torch.float32, "bf16": torch.bfloat16}[dtype]
-    angle = torch.rand(TOKENS, 1, D // HEADS // 2)
-    net = nn.ModuleList(torch_dit.Block(D, HEADS, FFN, storage, RANK, angle) for _ in range(LAYERS))
+    c = torch_dit.preset("dar-tiny")
+    d, a = c["dit"], c["adapter"]
+    D, C, P, R, channels = d["width"], d["latent"], d["patch"], a["unshuffle"], a["rays"] + a["geometry"]
+    h, w = HEIGHT // (2 * R), WIDTH // (2 * R)  # tokens
+    TOKENS = FRAMES * h * w
+    angle = torch.rand(TOKENS, 1, D // d["heads"] // 2)
+    net = nn.ModuleList(torch_dit.Block(D, d["heads"], d["ffn"], storage, RANK, angle) for _ in range(d["layers"]))
 
     def frozen(module):
         return module.to(storage).requires_grad_(False)
 
-    patch = frozen(nn.Linear(4 * (2 * LATENT + 4), D))
-    head = frozen(nn.Linear(D, 4 * LATENT))
-    text = frozen(nn.Sequential(nn.Linear(TEXT, D), nn.GELU("tanh"), nn.Linear(D, D)))
-    times = frozen(nn.Sequential(nn.Linear(128, D), nn.SiLU(), nn.Linear(D, D), nn.SiLU(), nn.Linear(D, 6 * D)))
-    unshuffle = nn.Conv2d(CHANNELS * R * R, D, 2, stride=2).to(storage)
+    patch = frozen(nn.Linear(P * P * (2 * C + d["mask"]), D))
+    head = frozen(nn.Linear(D, P * P * C))
+    text = frozen(nn.Sequential(nn.Linear(d["text_width"], D), nn.GELU("tanh"), nn.Linear(D, D)))
+    times = frozen(nn.Sequential(nn.Linear(d["frequencies"], D), nn.SiLU(), nn.Linear(D, D),
+                                 nn.SiLU(), nn.Linear(D, 6 * D)))
+    unshuffle = nn.Conv2d(channels * R * R, D, 2, stride=2).to(storage)
     conv = nn.ModuleList(nn.Conv2d(D, D, 3, padding=1) for _ in range(2)).to(storage)
     trained = [p for m in (net, unshuffle, conv) for p in m.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=1e-4, fused=True)
-    z0 = torch.randn(BATCH, LATENT, FRAMES, 2 * ROWS, 2 * COLUMNS)
-    known = torch.randn(BATCH, LATENT + 4, FRAMES, 2 * ROWS, 2 * COLUMNS)
-    cond = torch.randn(BATCH * FRAMES, CHANNELS, 2 * R * ROWS, 2 * R * COLUMNS).to(storage)
-    words = torch.zeros(BATCH, WORDS, TEXT).to(storage)
-    first = torch.arange(TOKENS) < ROWS * COLUMNS
+    z0 = torch.randn(BATCH, C, FRAMES, P * h, P * w)
+    known = torch.randn(BATCH, C + d["mask"], FRAMES, P * h, P * w)
+    cond = torch.randn(BATCH * FRAMES, channels, HEIGHT, WIDTH).to(storage)
+    words = torch.zeros(BATCH, d["text_keys"], d["text_width"]).to(storage)
+    first = torch.arange(TOKENS) < h * w
+    n = torch.arange(d["frequencies"] // 2)
 
-    def tokens(x):  # [B, C, F, 2 h, 2 w] -> [B, L, 4 C]
-        x = x.unflatten(-1, (COLUMNS, 2)).unflatten(-3, (ROWS, 2))  # [B, C, F, h, 2, w, 2]
+    def tokens(x):  # [B, C, F, P h, P w] -> [B, L, P P C]
+        x = x.unflatten(-1, (w, P)).unflatten(-3, (h, P))  # [B, C, F, h, P, w, P]
         return x.permute(0, 2, 3, 5, 1, 4, 6).reshape(BATCH, TOKENS, -1)
 
     def velocity(z, t):
@@ -66,7 +71,7 @@ def torch_step(dtype):
         x = x + conv[1](F.relu(conv[0](x)))
         control = x.unflatten(0, (BATCH, FRAMES)).permute(0, 1, 3, 4, 2).reshape(BATCH, TOKENS, D)
         x = (patch(tokens(torch.cat([z, known], 1)).to(storage)) + control).float()
-        angle = torch.stack([0 * t, t], 1)[..., None] * 10000.0 ** (-torch.arange(64) / 64)
+        angle = torch.stack([0 * t, t], 1)[..., None] * 10000.0 ** (-n / len(n))
         e = times(torch.cat([angle.cos(), angle.sin()], -1).to(storage)).float().unflatten(-1, (6, D))  # [B, 2, 6, D]
         e = torch.where(first[None, None, :, None], e[:, 0, :, None], e[:, 1, :, None])
         context = text(words)
@@ -78,7 +83,7 @@ def torch_step(dtype):
         sigma, eps = torch.rand(BATCH), torch.randn_like(z0)
         mix = sigma.view(-1, 1, 1, 1, 1)
         v = velocity((1 - mix) * z0 + mix * eps, 1000 * sigma)
-        F.mse_loss(v[:, ROWS * COLUMNS :], tokens(eps - z0)[:, ROWS * COLUMNS :]).backward()
+        F.mse_loss(v[:, h * w :], tokens(eps - z0)[:, h * w :]).backward()
         torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
         optimizer.zero_grad()

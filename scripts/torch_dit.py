@@ -2,9 +2,17 @@
 
 What PyTorch likes best: fused attention; products in the storage type, the residual stream, norms and gates in f32.
 """
+import json
+
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
+
+
+def preset(name):
+    """The sizes of models/presets/NAME.json."""
+    with open(f"models/presets/{name}.json") as f:
+        return json.loads("".join(line for line in f if not line.lstrip().startswith("//")))
 
 
 def rms(x, w):
