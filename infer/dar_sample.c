@@ -19,7 +19,7 @@
 static struct {
     const char *out, *model, *weights, *part[DAR_MODEL_PARTS], *channels, *noise, *text, *negative;
     int64_t steps;
-    double guidance, shift, strength, tolerance;
+    double guidance, shift, strength, tolerance, guidance_tolerance;
     int solver, grid, precision, skip;
     int64_t window, overlap;
     dar_arg_list references, no_skip;
@@ -72,6 +72,9 @@ static const dar_option options[] = {
       .lo = 1, .hi = 1000, .help = "steps of the solver" },
     { .name = "guidance", .placeholder = "G", .type = DAR_ARG_NUMBER, .target = &o.guidance, .standard = "3",
       .lo = 1, .hi = 100, .help = "how much more the prompt counts than the negative one; 1: no guidance" },
+    { .name = "guidance-tolerance", .placeholder = "G", .type = DAR_ARG_NUMBER, .target = &o.guidance_tolerance,
+      .standard = "0", .lo = 0, .hi = 1, .help = "leave out the negative prompt where that changes the velocity by "
+      "G of itself at most, as foretold (models/guidance.h); 0: never" },
     { .name = "shift", .placeholder = "S", .type = DAR_ARG_NUMBER, .target = &o.shift, .standard = "5",
       .lo = 0.01, .hi = 100, .help = "bends the steps towards noise" },
     { .name = "solver", .placeholder = "NAME", .type = DAR_ARG_CHOICE, .target = &o.solver, .standard = "euler",
@@ -165,6 +168,7 @@ static dar_status read_options(struct job *j, dar_err *e)
     *p = (dar_pipeline_options){ .sampler = dar_sampler_default(), .seed = o.common.seed };
     p->text = o.text, p->negative = o.negative;
     p->sampler.guidance = o.guidance;
+    p->sampler.guidance_tolerance = o.guidance_tolerance;
     p->sampler.solver.kind = (dar_solver_kind)o.solver;
     p->sampler.solver.grid = o.grid == DAR_GRIDS ? dar_solver_grid(p->sampler.solver.kind) : (dar_flow_grid)o.grid;
     p->sampler.solver.steps = (size_t)o.steps;
@@ -307,6 +311,7 @@ static void print_sampler(dar_json_writer *w, const struct job *j)
     dar_json_write_text(w, "precision", precision_names[o.precision]);
     dar_json_write_int(w, "steps", (int64_t)c->solver.steps);
     dar_json_write_number(w, "guidance", c->guidance);
+    if (c->guidance_tolerance > 0) dar_json_write_number(w, "guidance_tolerance", c->guidance_tolerance);
     dar_json_write_number(w, "shift", c->solver.shift);
     dar_json_write_text(w, "solver", dar_solver_name[c->solver.kind]);
     if (c->solver.tolerance > 0) dar_json_write_number(w, "tolerance", c->solver.tolerance);
@@ -427,6 +432,8 @@ static void tell_video(struct job *j, const dar_pipeline *p, const struct hearin
     dar_json_write_int(&j->r->json, "steps", (int64_t)ran->steps);
     dar_json_write_int(&j->r->json, "steps_rejected", (int64_t)ran->rejected);
     dar_json_write_number(&j->r->json, "estimated_error", ran->estimate);
+    dar_json_write_int(&j->r->json, "guidance_left_out", (int64_t)ran->left_out);
+    dar_json_write_number(&j->r->json, "guidance_error", ran->worst);
     dar_json_write_object(&j->r->json, "seconds");
     dar_json_write_number(&j->r->json, "encode", encode);
     dar_json_write_number(&j->r->json, "sample", sample);

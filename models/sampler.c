@@ -186,6 +186,7 @@ struct run {
     double *times;     /* [frames of a window] as told to the network, in rows */
     int64_t rows;
     bool hold;                  /* the first frame is known */
+    bool both;                  /* prompts are asked */
     dar_tensor z, v[2];         /* of a window: latent, velocities with both prompts */
     dar_tensor whole[2], clean; /* of the clip: velocities, where the step saw it go */
 };
@@ -251,13 +252,13 @@ static void finish(dar_sampler *s, const struct begun *b, int prompt, bool keep,
     s->calls++;
 }
 
-/* Both velocities of window i. */
+/* The velocities of window i. */
 static void call(dar_sampler *s, const struct run *r, int64_t i)
 {
     dar_tape_place place = dar_tape_mark(&s->step);
     struct begun b;
-    for (int prompt = 0; prompt <= s->twice; prompt++) {
-        bool share = s->twice && skips(s, DAR_SKIP_BEGIN);
+    for (int prompt = 0; prompt <= r->both; prompt++) {
+        bool share = r->both && skips(s, DAR_SKIP_BEGIN);
         if (prompt == 0 || !share) begin(s, r, i, &b);
         finish(s, &b, prompt, share && prompt == 0, &r->v[prompt]);
         if (!share) dar_tape_reset(&s->step, place);
@@ -265,15 +266,15 @@ static void call(dar_sampler *s, const struct run *r, int64_t i)
     dar_tape_reset(&s->step, place);
 }
 
-/* Both velocities of the clip: r->whole. */
+/* The velocities of the clip: r->whole. */
 static void call_all(dar_sampler *s, struct run *r, const dar_tensor *z)
 {
-    for (int p = 0; p <= s->twice && !plans(s) && s->windows > 1; p++) dar_tensor_fill(&r->whole[p], 0);
+    for (int p = 0; p <= r->both && !plans(s) && s->windows > 1; p++) dar_tensor_fill(&r->whole[p], 0);
     for (int64_t i = 0; i < s->windows; i++) {
         dar_mark m = dar_arena_mark(s->kept.arena);
         r->z = gather(s, i, z, s->kept.arena);
         call(s, r, i);
-        for (int p = 0; p <= s->twice && !plans(s) && s->windows > 1; p++) scatter(s, i, &r->v[p], &r->whole[p]);
+        for (int p = 0; p <= r->both && !plans(s) && s->windows > 1; p++) scatter(s, i, &r->v[p], &r->whole[p]);
         dar_arena_reset(s->kept.arena, m);
     }
 }
@@ -298,20 +299,23 @@ static void hold_still(const dar_tensor *v)
 static dar_status run_steps(dar_sampler *s, struct run *r, const dar_tensor *first, const dar_tensor *z,
                             dar_sampler_told *told, void *ctx, dar_err *e)
 {
-    const double g = s->c.guidance, weight[] = { g, 1 - g };
     const dar_tensor *v = &r->whole[0], *u = &r->whole[1];
     dar_solver solver;
+    dar_guidance guidance;
     dar_solver_init(&solver, &s->c.solver, z, s->kept.arena);
+    dar_guidance_init(&guidance, s->c.guidance, s->twice ? s->c.guidance_tolerance : 0, z, s->kept.arena);
+    r->both = s->twice;
     if (first && !plans(s)) dar_dit_hold_first(z, first);
     for (size_t i = 0; i < solver.steps && plans(s); i++) {
         write_times(s, r, 0);
         call_all(s, r, z);
     }
     while (solver.step < solver.steps && !plans(s)) {
-        const double to_clean[] = { 1, -solver.sigma[solver.step] };
+        const double sigma = solver.sigma[solver.step], to_clean[] = { 1, -sigma };
+        r->both = s->twice && dar_guidance_asks(&guidance, sigma);
         write_times(s, r, solver.time[solver.step]);
         call_all(s, r, z);
-        if (s->twice) dar_flow_combine(2, weight, (const dar_tensor *const[]){ v, u }, v);
+        if (s->twice) dar_guidance_apply(&guidance, sigma, r->both ? u : NULL, v);
         DAR_TRY(check_finite(&solver, v, e));
         if (first) hold_still(v);
         if (told) dar_flow_combine(2, to_clean, (const dar_tensor *const[]){ z, v }, &r->clean);
@@ -321,6 +325,7 @@ static dar_status run_steps(dar_sampler *s, struct run *r, const dar_tensor *fir
         if (told) DAR_TRY(told(ctx, solver.step, z, &r->clean, e));
     }
     s->steps = solver.calls, s->rejected = solver.rejected, s->estimate = solver.estimate;
+    s->left_out = guidance.left_out, s->worst = guidance.worst;
     return DAR_OK;
 }
 

@@ -27,6 +27,7 @@
 #define DAR_MODELS_SAMPLER_H
 
 #include "models/dit.h"
+#include "models/guidance.h"
 #include "models/solver.h"
 
 typedef enum dar_skip {
@@ -48,8 +49,9 @@ extern const char *const dar_skip_name[DAR_SKIPS + 1]; /* "pass", ..., NULL */
 
 typedef struct dar_sampler_config {
     dar_solver_config solver;
-    double guidance; /* g; 1: none */
-    unsigned skip;   /* bits 1 << dar_skip */
+    double guidance;           /* g; 1: none */
+    double guidance_tolerance; /* G (models/guidance.h); 0: u is computed in every step */
+    unsigned skip;             /* bits 1 << dar_skip */
 } dar_sampler_config;
 
 /* The paper's: 50 steps of Euler, shift 5, guidance 3; every skip. */
@@ -79,6 +81,8 @@ typedef struct dar_sampler {
     /* Of the last run (models/solver.h): steps that were called, of them taken back, estimated error. */
     size_t steps, rejected;
     double estimate;
+    size_t left_out; /* steps without u; and the error of what stood for it, where that was compared */
+    double worst;
 
     /* Of the sampler itself. */
     dar_tape kept, step;

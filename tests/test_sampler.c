@@ -7,8 +7,15 @@
 #include "lib/rng_torch.h"
 #include "lib/thread.h"
 #include "tests/distance.h"
-#include "tests/fixture.h"
 #include "tests/model.h"
+
+static dar_weights *open_fixture(const char *path)
+{
+    dar_weights *f;
+    dar_err e;
+    CHECK(dar_weights_open(&f, path, &e) == DAR_OK, "%s", e.text);
+    return f;
+}
 
 /* ---------------------------------------------------------------- the fixture's first clip */
 
@@ -36,8 +43,8 @@ static void init(struct bench *b, dar_dtype storage)
     dar_config c = model_preset("dar-test");
     dar_err e;
     *b = (struct bench){ .c = dar_sampler_default() };
-    b->weights = fixture_open("dit_weights.safetensors");
-    b->lora = fixture_open("dit_lora.safetensors");
+    b->weights = open_fixture("tests/fixtures/dit_weights.safetensors");
+    b->lora = open_fixture("tests/fixtures/dit_lora.safetensors");
     model_init(&b->o, &c, storage, false);
     dar_lora_init(&b->o.m, &b->o.p, &c.lora);
     model_fixture(&b->o, b->weights);
@@ -122,7 +129,7 @@ static void same_bits(const dar_tensor *x, const dar_tensor *y)
 static void five_steps(void **state)
 {
     (void)state;
-    dar_weights *steps = fixture_open("dit_steps.safetensors");
+    dar_weights *steps = open_fixture("tests/fixtures/dit_steps.safetensors");
     for (int merged = 0; merged < 2; merged++) {
         struct bench b;
         struct walk w = { .steps = steps };
@@ -235,15 +242,6 @@ static double apart(const dar_tensor *x, int64_t i, const dar_tensor *y, int64_t
 
 static const int line[] = { 0, 1, 2, 3, 4, 5, 6, 7, 8 };
 
-/* The fixture's model, and a clip of so many of these frames; what they are taken from. */
-static struct bench init_line(struct bench *b, int64_t frames)
-{
-    init(b, DAR_F64);
-    struct bench from = { .clip = b->clip, .known = b->known, .noise = b->noise };
-    edit(b, &from, line, frames);
-    return from;
-}
-
 /* Windows as long as the clip are the plain run. */
 static void one_window(void **state)
 {
@@ -251,7 +249,9 @@ static void one_window(void **state)
     struct bench b;
     struct walk w = { 0 };
     size_t calls;
-    init_line(&b, 9);
+    init(&b, DAR_F64);
+    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
+    edit(&b, &from, line, 9);
     dar_tensor plain = sample(&b, &w, &calls);
     assert_int_equal(calls, 10);
     b.clip.window = 9, b.clip.overlap = 4, w.seen = 0;
@@ -267,7 +267,9 @@ static void several_windows(void **state)
     struct bench b;
     struct walk w = { 0 };
     size_t calls;
-    struct bench from = init_line(&b, 9);
+    init(&b, DAR_F64);
+    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
+    edit(&b, &from, line, 9);
     b.clip.window = 5, b.clip.overlap = 2; /* frames 1 2 3 4, 3 4 5 6, 5 6 7 8 */
     dar_tensor many = sample(&b, &w, &calls);
     assert_int_equal(calls, 30);
@@ -294,7 +296,8 @@ static void no_seam(void **state)
     struct bench b;
     struct walk w = { 0 };
     dar_tensor alone[2];
-    struct bench from = init_line(&b, 7);
+    init(&b, DAR_F64);
+    struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
     b.c.solver.steps = 1;
     for (int i = 0; i < 2; i++) {
         w.seen = 0;
@@ -398,6 +401,40 @@ static void tolerance(void **state)
     dar_threads_set(threads);
 }
 
+static void guidance_tolerance(void **state)
+{
+    (void)state;
+    int threads = dar_threads();
+    struct bench b;
+    struct walk w = { .jumps = true };
+    size_t calls;
+    init(&b, DAR_F32);
+    b.c.solver.steps = 20;
+    b.clip.text[1] = first_clip(&b, &b.clip.text[0], b.o.p.main, 0); /* prompts that differ little */
+    dar_flow_combine(1, (double[]){ 1.02 }, (const dar_tensor *[]){ &b.clip.text[0] }, &b.clip.text[1]);
+    dar_tensor plain = sample(&b, &w, NULL), z[3];
+    b.c.guidance_tolerance = 1e-300;
+    z[0] = sample(&b, &w, &calls);
+    same_bits(&z[0], &plain);
+    assert_int_equal(calls, 40);
+    b.c.guidance_tolerance = 1e-2;
+    for (int n = 0; n < 3; n++) {
+        dar_threads_set(n + 1);
+        z[n] = sample(&b, &w, &calls);
+        same_bits(&z[n], &z[0]);
+    }
+    dar_threads_set(threads);
+    double off = test_relative(&z[0], &plain);
+    printf("sampler: guidance with a tolerance: %zu calls, %.2g from the plain run\n", calls, off);
+    CHECK(calls > 20 && calls < 40, "%zu calls", calls);
+    CHECK(off > 0 && off <= 1e-2, "%g from the plain run", off);
+    b.c.skip = 0; /* nothing is shared between the prompts */
+    dar_tensor slow = sample(&b, &w, NULL);
+    off = test_relative(&slow, &plain); /* rounding may decide otherwise */
+    CHECK(off > 0 && off <= 1e-2, "without skips: %g from the plain run", off);
+    drop(&b);
+}
+
 /* One preparation, several runs: each as if alone.  A run that was stopped leaves nothing behind. */
 static void prepared_once(void **state)
 {
@@ -438,7 +475,7 @@ static void plan_is_what_is_taken(void **state)
         dar_err e;
         init(&b, DAR_F32);
         b.c.solver.kind = (dar_solver_kind)(k % DAR_SOLVERS);
-        b.c.solver.tolerance = k < DAR_SOLVERS ? 0 : 0.1;
+        b.c.solver.tolerance = b.c.guidance_tolerance = k < DAR_SOLVERS ? 0 : 0.1;
         b.c.solver.grid = dar_solver_grid(b.c.solver.kind);
         b.kept.peak = b.o.step.peak = 0;
         sample(&b, &w, NULL);
@@ -510,6 +547,7 @@ int main(void)
         cmocka_unit_test(equal_prompts_are_one),
         cmocka_unit_test(any_threads),
         cmocka_unit_test(tolerance),
+        cmocka_unit_test(guidance_tolerance),
         cmocka_unit_test(prepared_once),
         cmocka_unit_test(plan_is_what_is_taken),
         cmocka_unit_test(numbers_must_be_finite),
