@@ -301,9 +301,9 @@ static void ensure_grad(dar_tape *t, dar_val *v)
 static void release_grad(dar_tape *t, dar_val *v)
 {
     if (v->leaf || !v->g.data) return;
-    give(t, v->g.data, dar_tensor_bytes(&v->g));
+    if (!v->lent) give(t, v->g.data, dar_tensor_bytes(&v->g));
     v->g.data = NULL;
-    v->has_grad = false;
+    v->has_grad = v->lent = false;
 }
 
 static void view_backward(dar_tape *t, const dar_node *node)
@@ -313,6 +313,7 @@ static void view_backward(dar_tape *t, const dar_node *node)
 
     if (whole && !x->g.data && !y->leaf && dar_tensor_contiguous(&x->x) && dar_tensor_contiguous(&y->x)) {
         x->g = dar_tensor_reshape(&y->g, x->x.shape); /* the same numbers in the same order: hand the buffer on */
+        x->lent = y->lent;
         y->g.data = NULL;
     } else {
         ensure_grad(t, x);
@@ -337,6 +338,7 @@ static void hand_on(const dar_op *op, dar_val *x, dar_val *y)
     if (!op->in_place || !grad_goes_to(op, x, 0) || x->g.data || y->leaf) return;
     if (!dar_shape_equal(&x->x.shape, &y->x.shape) || dar_compute_type(x->x.dtype) != y->g.dtype) return;
     x->g = y->g;
+    x->lent = y->lent;
     y->g.data = NULL;
 }
 
@@ -408,9 +410,25 @@ static bool is_cut(const dar_node *node, int i)
     return !node->fn && node->rows.cut & DAR_KEEP_X(i);
 }
 
+/* What the pieces of a segment find. */
+struct found {
+    bool had[DAR_OP_IN]; /* inputs with a gradient from others */
+    bool pass;           /* the gradient of input 0 becomes what that of y was */
+};
+
+/* Where input 0 is like y and nobody else has given it a gradient yet, as around a residual, one buffer is enough. */
+static bool passes(const dar_node *node)
+{
+    const dar_val *x = node->n ? node->in[0] : NULL, *y = node->y;
+    if (!x || !x->wants_grad || x->g.data || !(node->fn || is_cut(node, 0))) return false;
+    for (int i = 1; i < node->n; i++)
+        if (node->in[i] == x) return false;
+    return dar_shape_equal(&x->x.shape, &y->x.shape) && dar_compute_type(x->x.dtype) == y->g.dtype;
+}
+
 /* Stand-ins for the segment's inputs, or for a piece of them, sharing value and gradient; the same value stays one
- * value.  had: those that have a gradient from others. */
-static void stand_in(dar_tape *t, const dar_node *node, const bool *had, const dar_rows *rows, dar_val **in)
+ * value. */
+static void stand_in(dar_tape *t, const dar_node *node, const struct found *f, const dar_rows *rows, dar_val **in)
 {
     for (int i = 0; i < node->n; i++) {
         for (int j = 0; j < i; j++)
@@ -423,7 +441,7 @@ static void stand_in(dar_tape *t, const dar_node *node, const bool *had, const d
         if (!is_cut(node, i)) continue;
         in[i]->x = dar_rows_view(&in[i]->x, *rows);
         if (in[i]->g.data) in[i]->g = dar_rows_view(&in[i]->g, *rows);
-        in[i]->has_grad = had[i];
+        in[i]->has_grad = f->had[i];
     }
 }
 
@@ -432,9 +450,10 @@ static dar_val *run_piece(dar_tape *t, const dar_node *node, dar_val *const *in,
     return node->fn ? node->fn(t, node->arg, in) : node->rows.fn(t, node->arg, in, *rows);
 }
 
-static void piece_backward(dar_tape *t, const dar_node *node, const bool *had, int64_t i)
+static void piece_backward(dar_tape *t, const dar_node *node, const struct found *f, int64_t i)
 {
     dar_rows rows = node->fn ? (dar_rows){ 0 } : dar_rows_of(&node->rows.shape, node->rows.most, i);
+    dar_tensor g = node->fn ? node->y->g : dar_rows_view(&node->y->g, rows);
     dar_val *in[DAR_OP_IN] = { 0 };
     struct place p = enter(t);
 
@@ -444,13 +463,14 @@ static void piece_backward(dar_tape *t, const dar_node *node, const bool *had, i
     t->kept = t->keep && node->kept ? &node->kept[i] : NULL;
     if (t->kept) t->kept->at = 0;
     t->replaying = true;
-    stand_in(t, node, had, &rows, in);
+    stand_in(t, node, f, &rows, in);
     dar_val *y = run_piece(t, node, in, &rows);
     if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
-    y->g = node->fn ? node->y->g : dar_rows_view(&node->y->g, rows);
-    y->leaf = !node->fn; /* a part of another's gradient is not handed on */
+    y->g = g;
+    y->lent = f->pass || !node->fn; /* a part of it is not free before the rest is */
     y->has_grad = true;
     sweep(t, NULL);
+    if (f->pass && in[0]->g.data && in[0]->g.data != g.data && !t->arena->plan) dar_tensor_copy(&g, &in[0]->g);
     for (int k = 0; k < node->n; k++)
         if (in[k]) node->in[k]->has_grad = in[k]->has_grad;
     leave(t, &p);
@@ -458,13 +478,22 @@ static void piece_backward(dar_tape *t, const dar_node *node, const bool *had, i
 
 static void segment_backward(dar_tape *t, const dar_node *node)
 {
-    bool had[DAR_OP_IN] = { false };
+    struct found f = { .pass = passes(node) };
+    dar_val *x = node->in[0], *y = node->y;
 
     for (int i = 0; i < node->n; i++) {
-        if (node->in[i] && node->in[i]->wants_grad) ensure_grad(t, node->in[i]); /* before the mark: it stays */
-        had[i] = node->in[i] && node->in[i]->has_grad;
+        dar_val *v = node->in[i];
+        if (v && v->wants_grad && !(f.pass && i == 0)) ensure_grad(t, v); /* before the mark: it stays */
+        f.had[i] = v && v->has_grad;
     }
-    for (int64_t i = 0; i < pieces_of(node); i++) piece_backward(t, node, had, i);
+    for (int64_t i = 0; i < pieces_of(node); i++) {
+        if (f.pass) x->has_grad = false;
+        piece_backward(t, node, &f, i);
+    }
+    if (!f.pass || !x->has_grad) return;
+    x->g = y->g;
+    x->lent = y->lent;
+    y->g.data = NULL;
 }
 
 /* What only this node and what came after it have read is free. */

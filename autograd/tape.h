@@ -25,6 +25,7 @@ typedef struct dar_val {
     bool has_grad; /* g holds something to add to */
     bool leaf;     /* g is the owner's memory: kept, and added to from step to step */
     bool own;      /* x is the tape's memory and this value's alone */
+    bool lent;     /* g is memory that somebody else gives back */
     bool read;     /* backward, or a view, reads x */
 } dar_val;
 

@@ -50,7 +50,8 @@ static dar_val *feed_forward(dar_tape *t, void *arg, dar_val *const *in)
     const struct half *h = arg;
     dar_val *y = dar_rms_norm(t, in[0], h->w[NORM - WQ], &(dar_norm_opt){ .eps = 1e-6 });
     y = dar_gelu_tanh(t, product(t, y, h->w[UP - WQ]));
-    return dar_add(t, in[0], product(t, y, h->w[DOWN - WQ]));
+    y = product(t, y, h->w[DOWN - WQ]);
+    return h->mode->cut ? dar_add(t, y, in[0]) : dar_add(t, in[0], y); /* the first is handed the gradient of the sum */
 }
 
 static dar_val *feed_forward_rows(dar_tape *t, void *arg, dar_val *const *in, dar_rows r)
