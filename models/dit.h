@@ -49,12 +49,13 @@ typedef struct dar_dit_block {
 typedef enum dar_dit_replay {
     DAR_REPLAY_ALL,
     DAR_REPLAY_PRODUCTS, /* all but attention */
+    DAR_REPLAY_WIDE,     /* of products, the one whose result is as wide as the feed-forward layer */
     DAR_REPLAY_CHEAP,    /* norms, modulation, rotation, activations: a few percent of the time */
     DAR_REPLAY_NOTHING,
     DAR_REPLAYS
 } dar_dit_replay;
 
-extern const char *const dar_dit_replay_name[DAR_REPLAYS + 1]; /* "all", "products", "cheap", "nothing", NULL */
+extern const char *const dar_dit_replay_name[DAR_REPLAYS + 1]; /* "all", "products", "wide", "cheap", "nothing", NULL */
 
 typedef struct dar_dit {
     dar_dit_config c;

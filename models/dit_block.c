@@ -3,7 +3,7 @@
 
 enum { SHIFT, SCALE, GATE };
 
-const char *const dar_dit_replay_name[] = { "all", "products", "cheap", "nothing", NULL };
+const char *const dar_dit_replay_name[] = { "all", "products", "wide", "cheap", "nothing", NULL };
 
 dar_val *dar_dit_multiply(dar_tape *t, const dar_dit *m, const dar_dit_product *p, dar_act act, dar_keep keep,
                           dar_val *x)
@@ -65,8 +65,10 @@ static dar_val *last_product(dar_tape *t, const struct block *a, dar_projection 
  * type, is then all that is kept. */
 static dar_val *activated(dar_tape *t, const struct block *a, dar_val *x)
 {
-    if (a->cheap) return dar_gelu_tanh(t, product(t, a, DAR_FFN_UP, x));
-    return dar_dit_multiply(t, a->m, &a->b->product[DAR_FFN_UP], DAR_ACT_GELU_TANH, DAR_KEEP_NOTHING, x);
+    const dar_dit_product *up = &a->b->product[DAR_FFN_UP];
+    dar_keep keep = a->m->replay == DAR_REPLAY_CHEAP ? DAR_KEEP_ALL : DAR_KEEP_NOTHING;
+    if (a->cheap) return dar_gelu_tanh(t, dar_dit_multiply(t, a->m, up, DAR_ACT_NONE, keep, x));
+    return dar_dit_multiply(t, a->m, up, DAR_ACT_GELU_TANH, keep, x);
 }
 
 static dar_keep keep_attention(const struct block *a)
@@ -236,7 +238,7 @@ static dar_val *segment(dar_tape *t, dar_segment_fn *fn, struct block *a, dar_va
 static dar_val *segments(dar_tape *t, const struct block *b, dar_val *tokens)
 {
     struct block *a = dar_tape_store(t, b, sizeof *b);
-    a->cheap = b->m->replay == DAR_REPLAY_CHEAP && t->keep;
+    a->cheap = b->m->replay >= DAR_REPLAY_WIDE && t->keep;
     if (!a->cheap) return segment(t, block_segment, a, tokens);
     tokens = segment(t, cross_segment, a, segment(t, self_segment, a, tokens));
     return feed_forward_pieces(t, a, tokens, false);

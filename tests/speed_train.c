@@ -18,7 +18,7 @@ static int precision, recompute;
 static const char *preset;
 static dar_common common;
 
-static const char *const recompute_names[] = { "none", "cheap", "selective", "full", NULL };
+static const char *const recompute_names[] = { "none", "cheap", "wide", "selective", "full", NULL };
 
 static const char *const precision_names[] = { "f64", "f32", "bf16", NULL }; /* dar_dtype */
 
@@ -29,7 +29,7 @@ static const dar_option options[] = {
     { .name = "precision", .placeholder = "TYPE", .type = DAR_ARG_CHOICE, .target = &precision, .standard = "bf16",
       .names = precision_names, .help = "f64, f32 or bf16" },
     { .name = "recompute", .placeholder = "WAY", .type = DAR_ARG_CHOICE, .target = &recompute, .standard = "none",
-      .names = recompute_names, .help = "none, cheap, selective or full" },
+      .names = recompute_names, .help = "none, cheap, wide, selective or full" },
     { .name = "rank", .placeholder = "R", .type = DAR_ARG_INT, .target = &rank, .standard = "32", .lo = 0, .hi = 4096,
       .help = "of additions; 0: all weights are trained" },
     { .name = "batch", .placeholder = "B", .type = DAR_ARG_INT, .target = &batch, .standard = "4", .lo = 1, .hi = 256,

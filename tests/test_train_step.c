@@ -184,7 +184,8 @@ static void ways_agree(void **state)
     }
     a.c.recompute = DAR_RECOMPUTE_AUTO;
     assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_NONE]), DAR_RECOMPUTE_CHEAP);
-    assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_CHEAP] - 1), DAR_RECOMPUTE_MOST);
+    assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_CHEAP] - 1), DAR_RECOMPUTE_WIDE);
+    assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_WIDE] - 1), DAR_RECOMPUTE_MOST);
     assert_int_equal(dar_step_choose(&a.c, p, bytes[DAR_RECOMPUTE_MOST] - 1), DAR_RECOMPUTE_ALL);
     assert_int_equal(dar_step_choose(&a.c, p, 0), DAR_RECOMPUTE_ALL);
     stop(&a);

@@ -12,7 +12,7 @@
 
 #define MOST_RATE 1e3
 
-const char *const dar_recompute_name[] = { "auto", "none", "cheap", "selective", "full", NULL };
+const char *const dar_recompute_name[] = { "auto", "none", "cheap", "wide", "selective", "full", NULL };
 
 static const char *const what_names[] = { "lora", "full", "vae", NULL };
 static const char *const storage_names[] = { "f64", "f32", "bf16", NULL }; /* dar_dtype */

@@ -22,8 +22,9 @@
  *   target_modules               list of names    all ten  of models/config.h, lora.targets
  *   mixed_precision              f64 | f32 | bf16  bf16    of products' operands and frozen weights; sums, trained
  *                                                          weights and what is listed in models/dit.h are f32 or wider
- *   gradient_checkpointing       auto | none | cheap | selective | full   auto   keep everything; in backward compute
- *                                                          again what costs little; blocks but their attention; blocks
+ *   gradient_checkpointing       auto | none | cheap | wide | selective | full   auto   keep everything; in backward
+ *                                                          compute again what costs little; that and the widest
+ *                                                          product; blocks but their attention; blocks
  *   memory_budget                >= 0 [GB]        0        of which auto takes the fastest that fits; 0: the machine's
  *
  *   learning_rate                >= 0             1e-4
@@ -95,6 +96,7 @@ typedef enum dar_recompute {
     DAR_RECOMPUTE_AUTO,
     DAR_RECOMPUTE_NONE,
     DAR_RECOMPUTE_CHEAP,
+    DAR_RECOMPUTE_WIDE,
     DAR_RECOMPUTE_MOST,
     DAR_RECOMPUTE_ALL
 } dar_recompute;

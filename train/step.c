@@ -181,9 +181,8 @@ dar_step_report dar_step_look(dar_step *s, const dar_batch *b, int64_t step)
 static void set_way(dar_step *s, dar_recompute how)
 {
     static const dar_dit_replay replay[] = {
-        [DAR_RECOMPUTE_NONE] = DAR_REPLAY_NOTHING,
-        [DAR_RECOMPUTE_CHEAP] = DAR_REPLAY_CHEAP,
-        [DAR_RECOMPUTE_MOST] = DAR_REPLAY_PRODUCTS,
+        [DAR_RECOMPUTE_NONE] = DAR_REPLAY_NOTHING, [DAR_RECOMPUTE_CHEAP] = DAR_REPLAY_CHEAP,
+        [DAR_RECOMPUTE_WIDE] = DAR_REPLAY_WIDE,    [DAR_RECOMPUTE_MOST] = DAR_REPLAY_PRODUCTS,
         [DAR_RECOMPUTE_ALL] = DAR_REPLAY_ALL,
     };
     s->how = how;
