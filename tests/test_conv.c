@@ -78,6 +78,8 @@ static const struct shape_of_conv shapes[] = {
     { "stride 2, causal, one frame known", 2, 3, 2, 6, 9, 1, 4, 3, 3, 3, { 2, 0, 1, 0, 1, 1, 2 } },
     { "stride 3 of 2x2", 1, 3, 1, 8, 11, 0, 4, 1, 2, 2, { 3, 1, 0, 0, 2, 1, 0 } },
     { "stride 2 of 4x5, wide border", 1, 2, 1, 5, 4, 0, 3, 1, 4, 5, { 2, 3, 4, 5, 1, 1, 0 } },
+    { "small frames of four clips, one known", 4, 5, 5, 4, 6, 1, 9, 3, 3, 3, { 1, 1, 1, 1, 1, 1, 2 } },
+    { "small frames of four clips, stride 2", 4, 3, 4, 7, 9, 0, 5, 3, 3, 3, { 2, 1, 0, 0, 1, 1, 2 } },
     { "many pixels of three clips", 3, 3, 4, 40, 41, 0, 5, 3, 3, 3, { 1, 1, 1, 1, 1, 1, 2 } },
     { "many pixels, one weight", 1, 1, 1, 380, 381, 0, 1, 1, 1, 1, { .stride = 1, .stride_t = 1 } },
     { "261 channels to 2, lopsided", 1, 261, 2, 3, 5, 1, 2, 3, 3, 4, { 1, 2, 0, 3, 0, 1, 2 } },
