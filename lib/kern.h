@@ -59,6 +59,8 @@ typedef struct dar_sums {
 typedef void dar_kern_map(size_t n, const void *x, void *y);
 typedef void dar_kern_map_back(size_t n, const void *x, const void *gy, void *gx);
 
+typedef void dar_kern_map_stored(size_t n, const void *x, void *y, bool stream);
+
 typedef struct dar_kern {
     const char *name; /* of the fastest set used: "ref", "avx2", "avx512", "bf16" */
 
@@ -83,6 +85,10 @@ typedef struct dar_kern {
      * (x + 0.044715 x^3).  "_back": gx = f'(x) gy. */
     dar_kern_map *exp, *tanh, *rsqrt, *silu, *gelu_tanh, *relu;
     dar_kern_map_back *silu_back, *gelu_tanh_back, *relu_back;
+
+    /* The same from and to rows stored as bf16, at one go: bits as by way of dar_row_get and dar_row_put.  stream:
+     * write past the caches where y is aligned as cache lines are. */
+    dar_kern_map_stored *silu_bf16, *gelu_tanh_bf16;
 
     void (*add)(size_t n, const void *a, const void *b, void *y);                    /* y = a + b */
     void (*mul)(size_t n, const void *a, const void *b, void *y);                    /* y = a b */

@@ -8,6 +8,7 @@
 /* clang-format off */
 #define DAR_KERN_SLOTS \
     SLOT(exp) SLOT(tanh) SLOT(rsqrt) SLOT(silu) SLOT(gelu_tanh) SLOT(relu) SLOT(silu_back) \
+    SLOT(silu_bf16) SLOT(gelu_tanh_bf16) \
     SLOT(gelu_tanh_back) SLOT(relu_back) SLOT(add) SLOT(mul) SLOT(offset) SLOT(scale) SLOT(axpy) \
     SLOT(mul_add) SLOT(sum) SLOT(dot) SLOT(max) SLOT(nonfinite) SLOT(exp_sum) \
     SLOT(softmax_back) SLOT(adamw) SLOT(dequantise)

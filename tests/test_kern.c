@@ -383,6 +383,33 @@ static void functions(void **state)
         }
 }
 
+/* All numbers of bf16, and rows of some lengths, streamed and not: bits as by way of rows of f32. */
+static void activations_of_bf16(void **state)
+{
+    enum { ALL = 1 << 16 };
+    static _Alignas(64) uint16_t x[ALL], y[ALL + 1], expect[ALL];
+    static float buf[ALL];
+    (void)state;
+    for (size_t i = 0; i < ALL; i++) x[i] = (uint16_t)i;
+    for (int k = 0; k < tables.n; k++) {
+        const dar_kern *f = &tables.f32[k];
+        dar_kern_map *map[] = { f->silu, f->gelu_tanh };
+        dar_kern_map_stored *stored[] = { f->silu_bf16, f->gelu_tanh_bf16 };
+        for (size_t v = 0; v < 2 * DAR_COUNT(map); v++) {
+            f->get[DAR_BF16](ALL, x, buf);
+            map[v / 2](ALL, buf, buf);
+            f->put[DAR_BF16](ALL, buf, expect, false);
+            for (size_t l = 0; l <= DAR_COUNT(lengths); l++) {
+                size_t n = l < DAR_COUNT(lengths) ? lengths[l] : ALL;
+                memset(y, 0x55, sizeof y);
+                stored[v / 2](n, x + ALL - n, y, v % 2);
+                CHECK(!memcmp(y, expect + ALL - n, n * sizeof *y) && y[n] == 0x5555, "%s, %s of bf16: %zu elements",
+                      f->name, v / 2 ? "gelu_tanh" : "silu", n);
+            }
+        }
+    }
+}
+
 static void ulps(void **state)
 {
     (void)state;
@@ -572,9 +599,16 @@ static int setup(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(exact_kernels),  cmocka_unit_test(functions),   cmocka_unit_test(ulps),
-        cmocka_unit_test(conversions),    cmocka_unit_test(streams),     cmocka_unit_test(reductions_see_everything),
-        cmocka_unit_test(quantised_rows), cmocka_unit_test(adamw_steps), cmocka_unit_test(moments_of_any_row),
+        cmocka_unit_test(exact_kernels),
+        cmocka_unit_test(functions),
+        cmocka_unit_test(activations_of_bf16),
+        cmocka_unit_test(ulps),
+        cmocka_unit_test(conversions),
+        cmocka_unit_test(streams),
+        cmocka_unit_test(reductions_see_everything),
+        cmocka_unit_test(quantised_rows),
+        cmocka_unit_test(adamw_steps),
+        cmocka_unit_test(moments_of_any_row),
     };
     return cmocka_run_group_tests(tests, setup, NULL) != 0;
 }

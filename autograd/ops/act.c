@@ -10,6 +10,7 @@ struct act {
     dar_dtype type;
     dar_put mode; /* of the result */
     dar_kern_map *fn;
+    dar_kern_map_stored *bf16; /* fn from and to bf16; NULL: there is none */
     dar_kern_map_back *back;
 };
 
@@ -25,6 +26,10 @@ static void forward_range(void *ctx, size_t begin, size_t end, int thread)
     const dar_tensor *x = &a->c->x[0], *y = &a->c->y;
     double buf[DAR_PIECE];
     (void)thread;
+    if (a->bf16 && x->dtype == DAR_BF16 && y->dtype == DAR_BF16) {
+        a->bf16(end - begin, dar_tensor_at(x, begin), dar_tensor_at(y, begin), a->mode == DAR_PUT_STREAM);
+        return;
+    }
     for (size_t i = begin; i < end; i += DAR_PIECE) {
         size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
         void *to = dar_row_out(a->type, y->dtype, dar_tensor_at(y, i), a->mode, buf);
@@ -47,24 +52,25 @@ static void backward_range(void *ctx, size_t begin, size_t end, int thread)
     }
 }
 
-static void forward(const dar_opctx *c, dar_kern_map *fn)
+static void forward(const dar_opctx *c, dar_kern_map *fn, dar_kern_map_stored *bf16)
 {
-    struct act a = { c, dar_op_compute(c), dar_put_for(dar_tensor_bytes(&c->y), false), fn, NULL };
+    struct act a = { c, dar_op_compute(c), dar_put_for(dar_tensor_bytes(&c->y), false), fn, bf16, NULL };
     dar_parallel_range(dar_tensor_count(&c->y), CHUNK, forward_range, &a);
 }
 
 static void backward(const dar_opctx *c, dar_kern_map_back *back)
 {
     if (!c->gx[0].data) return; /* frozen */
-    struct act a = { c, dar_op_compute(c), dar_put_for(dar_tensor_bytes(&c->gx[0]), c->add[0]), NULL, back };
+    struct act a = { c, dar_op_compute(c), dar_put_for(dar_tensor_bytes(&c->gx[0]), c->add[0]), NULL, NULL, back };
     dar_parallel_range(dar_tensor_count(&c->y), CHUNK, backward_range, &a);
 }
 
-/* The op around the kernels `name` and `name`_back, its samples, and its call. */
-#define ACT(NAME, ...)                                                                                                 \
+/* The op around the kernels `name` and `name`_back, with or without one for BF16, its samples, and its call. */
+#define ACT(NAME, BF16, ...)                                                                                           \
     static void NAME##_forward(const dar_opctx *c)                                                                     \
     {                                                                                                                  \
-        forward(c, dar_kern_for(dar_op_compute(c))->NAME);                                                             \
+        const dar_kern *k = dar_kern_for(dar_op_compute(c));                                                           \
+        forward(c, k->NAME, BF16);                                                                                     \
     }                                                                                                                  \
     static void NAME##_backward(const dar_opctx *c)                                                                    \
     {                                                                                                                  \
@@ -100,8 +106,9 @@ static void backward(const dar_opctx *c, dar_kern_map_back *back)
         .in = { { 2, { 5, 4001 } } }, .lo = -4, .hi = 4                                                                \
     }
 
-ACT(silu, ONE, ODD_TAIL, CHUNKS, { .in = { { 1, { 9 } } }, .lo = -80, .hi = 80 } /* both saturations */)
-ACT(gelu_tanh, ONE, ODD_TAIL, CHUNKS, { .in = { { 1, { 9 } } }, .lo = -30, .hi = 30 } /* both saturations */)
-ACT(relu, { .in = { { 1, { 1 } } }, .lo = -1, .hi = 1, .gap = 0.1 },
+ACT(silu, k->silu_bf16, ONE, ODD_TAIL, CHUNKS, { .in = { { 1, { 9 } } }, .lo = -80, .hi = 80 } /* both saturations */)
+ACT(gelu_tanh, k->gelu_tanh_bf16, ONE, ODD_TAIL, CHUNKS,
+    { .in = { { 1, { 9 } } }, .lo = -30, .hi = 30 } /* both saturations */)
+ACT(relu, NULL, { .in = { { 1, { 1 } } }, .lo = -1, .hi = 1, .gap = 0.1 },
     { .in = { { 2, { 3, 37 } } }, .lo = -4, .hi = 4, .gap = 0.1 },
     { .in = { { 2, { 5, 4001 } } }, .lo = -4, .hi = 4, .gap = 0.1 })
