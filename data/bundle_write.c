@@ -149,7 +149,7 @@ static dar_status make_rgb(dar_bundle_writer *w, dar_err *e)
     w->c.rgb = w->c.reference = true;
     if (m->width % 2 || m->height % 2) return DAR_OK;
     return dar_video_create(&w->video, in_dir(w, DAR_BUNDLE_VIDEO, path), (size_t)m->width, (size_t)m->height,
-                            &(dar_video_how){ m->fps, DAR_VIDEO_H264, NULL }, e);
+                            &(dar_video_how){ .fps = m->fps, .codec = DAR_VIDEO_H264 }, e);
 }
 
 static size_t stream_size(const dar_bundle_writer *w, int i)

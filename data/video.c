@@ -156,12 +156,13 @@ static dar_status allocate(dar_video **out, const char *path, dar_err *e)
 /* ---------------------------------------------------------------- writing */
 
 static const struct {
-    const char *format, *codec, *pixels, *key, *value;
+    const char *format, *codec, *pixels, *key;
+    int value;
 } codecs[DAR_VIDEO_CODECS] = {
-    [DAR_VIDEO_H264] = { "mp4", "libx264", "yuv420p", "-crf", "18" },
-    [DAR_VIDEO_SMALL] = { "mp4", "libx264", "yuv420p", "-crf", "30" },
-    [DAR_VIDEO_FFV1] = { "matroska", "ffv1", "bgr0", "-level", "3" },
-    [DAR_VIDEO_X264RGB] = { "matroska", "libx264rgb", "rgb24", "-qp", "0" },
+    [DAR_VIDEO_H264] = { "mp4", "libx264", "yuv420p", "-crf", 18 },
+    [DAR_VIDEO_SMALL] = { "mp4", "libx264", "yuv420p", "-crf", 30 },
+    [DAR_VIDEO_FFV1] = { "matroska", "ffv1", "bgr0", "-level", 3 },
+    [DAR_VIDEO_X264RGB] = { "matroska", "libx264rgb", "rgb24", "-qp", 0 },
 };
 
 static bool for_people(dar_video_codec codec)
@@ -180,7 +181,7 @@ static dar_status tag(char **out, const char *path, const char *name, const char
 static dar_status encode(dar_video *v, size_t width, size_t height, const dar_video_how *how, dar_err *e)
 {
     const dar_video_codec codec = how->codec;
-    char to[PATH_MAX + 8], size[32], rate[32], *comment;
+    char to[PATH_MAX + 8], size[32], rate[32], value[16], *comment;
     const char *argv[48] = { "ffmpeg",
                              "-nostdin",
                              "-v",
@@ -199,7 +200,7 @@ static dar_status encode(dar_video *v, size_t width, size_t height, const dar_vi
                              "-c:v",
                              codecs[codec].codec,
                              codecs[codec].key,
-                             codecs[codec].value,
+                             value,
                              "-pix_fmt",
                              codecs[codec].pixels };
     static const char *const colour[] = { "-vf",
@@ -220,6 +221,7 @@ static dar_status encode(dar_video *v, size_t width, size_t height, const dar_vi
     DAR_TRY(tag(&comment, v->path, "comment", how->comment, e));
     snprintf(size, sizeof size, "%zux%zu", width, height);
     snprintf(rate, sizeof rate, "%.6f", how->fps);
+    snprintf(value, sizeof value, "%d", codecs[codec].value + how->coarser);
     for (size_t i = 0; i < DAR_COUNT(colour) && for_people(codec); i++) argv[n++] = colour[i];
     for (size_t i = 0; i < DAR_COUNT(alone) && width * height <= SMALL; i++) argv[n++] = alone[i];
     if (comment) {
@@ -243,6 +245,7 @@ dar_status dar_video_create(dar_video **out, const char *path, size_t width, siz
                width, height);
     DAR_ASSERT(how->fps > 0 && how->fps <= 1000, "%s: %g frames per second", path, how->fps);
     *out = NULL;
+    DAR_ASSERT(!how->coarser || for_people(how->codec), "%s: codec %d is exact", path, (int)how->codec);
     if (for_people(how->codec) && (width | height) & 1)
         return dar_fail(e, DAR_ERR_USAGE, "%s: found %zux%zu, expected even sides for yuv420p", path, width, height);
     dar_status s = allocate(out, path, e);

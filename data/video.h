@@ -26,6 +26,7 @@ typedef struct dar_video dar_video;
 typedef struct dar_video_how {
     double fps;
     dar_video_codec codec;
+    int coarser;         /* added to crf; 6 halve the size, about */
     const char *comment; /* of the file; NULL: none */
 } dar_video_how;
 

@@ -16,6 +16,7 @@ static struct {
     int align;
     bool masked, no_reference, no_report, overwrite;
     int64_t tile;
+    double size;
     dar_common common;
 } o;
 
@@ -53,7 +54,10 @@ static const dar_option options[] = {
     { .help = "Report" },
     { .name = "no-report", .type = DAR_ARG_FLAG, .target = &o.no_report, .help = "numbers only: no report.html" },
     { .name = "tile", .placeholder = "PX", .type = DAR_ARG_INT, .target = &o.tile, .lo = 16, .hi = 4096,
-      .help = "width of a picture in it (default: as large as keeps the report below 60 MB, at most 320)" },
+      .help = "width of a picture in it (default: what its size has room for, at most 320)" },
+    { .name = "report-size", .placeholder = "MB", .type = DAR_ARG_NUMBER, .target = &o.size, .standard = "60",
+      .lo = 0.01, .hi = 10000, .help = "what it stays below: of many clips and methods pictures are smaller, then "
+      "coarser" },
 
     { .help = "People" },
     { .name = "study", .placeholder = "A:B...", .type = DAR_ARG_WORDS, .target = &o.study,
@@ -109,7 +113,7 @@ static dar_status open_codec(dar_eval *v, dar_err *e)
     return DAR_OK;
 }
 
-/* Pixels that a report of 60 MB has room for: some 0.02 bytes each, errors and base64 with them. */
+/* Pixels that the report has room for: some 0.02 bytes each, errors and base64 with them. */
 static size_t tile_width(const dar_eval *v)
 {
     static const size_t width[] = { 320, 288, 256, 224, 192, 160, 128, 96 };
@@ -120,7 +124,7 @@ static size_t tile_width(const dar_eval *v)
             double w = v->clip[c].width < width[i] ? (double)v->clip[c].width : (double)width[i];
             pixels += frames * w * w * (double)v->clip[c].height / (double)v->clip[c].width * (double)v->methods;
         }
-        if (pixels < 2.4e9) return width[i];
+        if (pixels < 40e6 * o.size) return width[i];
     }
     return width[DAR_COUNT(width) - 1];
 }
@@ -133,6 +137,7 @@ static dar_status find_all(dar_eval *v, const dar_run *r, dar_err *e)
     DAR_TRY(dar_eval_find_methods(v, r->program->rest, (size_t)r->program->rests, !o.no_reference, e));
     DAR_TRY(find_base(v, e));
     DAR_TRY(open_weights(v, e));
+    v->report = 0.7 * 1e6 * o.size; /* as base64 four thirds, and there are tables */
     v->tile = o.no_report ? 0 : o.tile ? (size_t)o.tile : tile_width(v);
     return DAR_OK;
 }

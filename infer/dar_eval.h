@@ -125,6 +125,7 @@ typedef struct dar_eval {
     size_t base;     /* the method that others are compared with */
     const char *out; /* directory that files go to */
     size_t tile;     /* width of a picture of the report [px]; 0: no report */
+    double report;   /* bytes that all films of it may have */
     dar_sheet sheet; /* of the report; rgb NULL: there is none */
 } dar_eval;
 

@@ -241,7 +241,7 @@ dar_status dar_eval_clip_run(dar_eval *v, size_t c, dar_err *e)
         if (s == DAR_OK && dar_interrupted())
             s = dar_fail(e, DAR_ERR_INTERRUPTED, "dar-eval: interrupted at %s; nothing was written", clip->name);
     }
-    if (s == DAR_OK && w.film) s = dar_eval_film_write(w.film, v->out, c, clip, e);
+    if (s == DAR_OK && w.film) s = dar_eval_film_write(w.film, v->out, c, clip, v->report / (double)v->clips, e);
     close_all(&w);
     return s;
 }

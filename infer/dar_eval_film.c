@@ -12,6 +12,8 @@
 
 #define FRAMES 81 /* of a video, at most: of longer clips every second, third, ... is shown */
 #define AROUND 2  /* between tiles [px] */
+#define STEP   5  /* of crf, by which a film that is too large is made coarser */
+#define STEPS  4  /* at most; then it stays as it is */
 
 enum { PICTURES, ERRORS, FILMS };
 
@@ -120,11 +122,11 @@ void dar_eval_film_close(dar_eval_film *f)
     free(f);
 }
 
-static dar_status write_film(const dar_eval_film *f, int k, const char *path, double fps, dar_err *e)
+static dar_status write_film(const dar_eval_film *f, int k, const char *path, double fps, int coarser, dar_err *e)
 {
     size_t w = across(&f->tiles[k]), h = down(&f->tiles[k]);
     dar_video *video;
-    const dar_video_how how = { .fps = fps / (double)f->step, .codec = DAR_VIDEO_SMALL };
+    const dar_video_how how = { .fps = fps / (double)f->step, .codec = DAR_VIDEO_SMALL, .coarser = coarser };
     DAR_TRY(dar_video_create(&video, path, w, h, &how, e));
     dar_status s = DAR_OK;
     for (size_t t = 0; t < f->frames && s == DAR_OK; t++) s = dar_video_write(video, f->rgb[k] + 3 * t * w * h, e);
@@ -133,10 +135,23 @@ static dar_status write_film(const dar_eval_film *f, int k, const char *path, do
     return s;
 }
 
+/* What compresses badly, as noise does, is told by its size alone. */
+static dar_status write_small(const dar_eval_film *f, int k, const char *path, double fps, double most, dar_err *e)
+{
+    struct stat st;
+    for (int i = 0; i <= STEPS; i++) {
+        DAR_TRY(write_film(f, k, path, fps, i * STEP, e));
+        if (stat(path, &st) != 0) return dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
+        if ((double)st.st_size <= most) break;
+    }
+    return DAR_OK;
+}
+
 dar_status dar_eval_film_write(const dar_eval_film *f, const char *out, size_t number, const dar_eval_clip *c,
-                               dar_err *e)
+                               double most, dar_err *e)
 {
     static const char *const ending[FILMS] = { "", "-error" };
+    static const double share[FILMS] = { 0.75, 0.25 };
     char path[PATH_MAX];
     if (snprintf(path, sizeof path, "%s/clips", out) >= PATH_MAX - 32)
         return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", out);
@@ -144,7 +159,7 @@ dar_status dar_eval_film_write(const dar_eval_film *f, const char *out, size_t n
     size_t n = strlen(path);
     for (int k = 0; k < FILMS; k++) {
         snprintf(path + n, sizeof path - n, "/%05zu%s.mp4", number, ending[k]);
-        DAR_TRY(write_film(f, k, path, c->fps, e));
+        DAR_TRY(write_small(f, k, path, c->fps, share[k] * most, e));
     }
     return DAR_OK;
 }

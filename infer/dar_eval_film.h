@@ -21,9 +21,9 @@ void dar_eval_film_close(dar_eval_film *f); /* accepts NULL */
 /* Frame t of a tile: rgb [H, W, 3], map [H, W] of errors from 0 to 1, or NULL. */
 void dar_eval_film_add(dar_eval_film *f, size_t tile, size_t t, const uint8_t *rgb, const float *map);
 
-/* clips/NUMBER.mp4 and clips/NUMBER-error.mp4 below `out`. */
+/* clips/NUMBER.mp4 and clips/NUMBER-error.mp4 below `out`, coarse enough for `most` bytes together. */
 dar_status dar_eval_film_write(const dar_eval_film *f, const char *out, size_t number, const dar_eval_clip *c,
-                               dar_err *e);
+                               double most, dar_err *e);
 
 /* Error 0 .. 1 as a colour from black over violet and orange to pale yellow, brighter all the way. */
 void dar_eval_film_colour(float error, uint8_t rgb[3]);

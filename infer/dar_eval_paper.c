@@ -94,10 +94,10 @@ static void main_table(struct paper *p, dar_metric_area area)
         begin(p, area == DAR_METRIC_MASK ? "Methods, foreground alone" : "Methods", p->v->methods, columns);
     if (!s) return;
     snprintf(s->note, sizeof s->note,
-             "%zu clip%s; mean over %s, then over clips.  In brackets: %s  **Best** and _second_ among rows that are "
+             "%zu clip%s; mean over %s, then over clips.  %s  **Best** and _second_ among rows that are "
              "ranked; † sampled by normalised time or of another protocol, not ranked, as the rows of reference.",
              n, n == 1 ? "" : "s", p->span == DAR_EVAL_LATER ? "frames but the first, which is given" : "frames",
-             n > 1 ? "95 % bootstrap interval over clips." : "nothing, one clip gives no interval.");
+             n > 1 ? "With 95 % bootstrap intervals over clips." : "One clip gives no interval.");
     name_rows(p, s);
     head(s, 1, "Clips", "");
     for (size_t m = 0; m < p->v->methods; m++) {

@@ -51,7 +51,7 @@ void dar_eval_sheets_free(dar_eval_sheets *s)
 
 static bool is_better(double a, double b, dar_eval_aim aim)
 {
-    return aim == DAR_EVAL_MORE ? a > b : aim == DAR_EVAL_LESS ? a < b : fabs(a - 1) < fabs(b - 1);
+    return aim == DAR_EVAL_MORE ? a > b : aim == DAR_EVAL_LESS ? a < b : fabs(log(a)) < fabs(log(b));
 }
 
 void dar_eval_sheet_rank(dar_eval_sheet *s, size_t k, const double *value, dar_eval_aim aim)

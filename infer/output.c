@@ -210,7 +210,7 @@ static dar_status begin_files(dar_output *o, dar_err *e)
     for (int i = 0; i < VIDEOS; i++) {
         if (!wanted[i]) continue;
         DAR_TRY(member(o, name[i], path, e));
-        dar_video_how how = { o->b->meta.fps, codec[i], o->settings };
+        dar_video_how how = { .fps = o->b->meta.fps, .codec = codec[i], .comment = o->settings };
         DAR_TRY(dar_video_create(&o->video[i], path, o->width, o->height, &how, e));
     }
     return DAR_OK;

@@ -6,6 +6,7 @@
 #include "data/png.h"
 #include "data/uri.h"
 #include "lib/json.h"
+#include "lib/rng.h"
 #include "lib/safetensors_write.h"
 #include "models/config.h"
 #include "models/vae_start.h"
@@ -180,7 +181,7 @@ static void test_size(void **state)
     assert_int_equal(dar_png_write("small/000000/0.png", 32, 24, 3, grey, &e), DAR_OK);
     GOOD("small", "--against", "set/000000", "-o", "size", "--no-report", "--align", "normalized-time");
     char *text = text_of("size/tables.md");
-    CHECK(strstr(text, "one clip gives no interval"), "%s", text);
+    CHECK(strstr(text, "One clip gives no interval"), "%s", text);
     CHECK(strstr(text, "small †"), "%s", text);
     mkdir("tall", 0777);
     mkdir("tall/000000", 0777);
@@ -472,6 +473,27 @@ static void test_report(void **state)
     CHECK(run_is_there("page/sheet.png"), "no sheet");
 }
 
+static void noise(uint8_t *rgb, size_t t)
+{
+    for (size_t i = 0; i < VALUES; i++) rgb[i] = (uint8_t)dar_rng_below(7, t, i, 256);
+}
+
+/* Films of noise are made coarser until they have room: seven tenths of 50 kB, of which pictures have three quarters,
+ * for two clips. */
+static void test_report_size(void **state)
+{
+    const long long room = 50000 * 7 / 10 * 3 / 4 / 2;
+    struct stat st[2];
+    (void)state;
+    make_method("noise", 2, noise, 1);
+    GOOD("noise", "--against", "set", "-o", "wide", "--tile", "64");
+    GOOD("noise", "--against", "set", "-o", "narrow", "--tile", "64", "--report-size", "0.05");
+    assert_int_equal(stat("wide/clips/00000.mp4", &st[0]), 0);
+    assert_int_equal(stat("narrow/clips/00000.mp4", &st[1]), 0);
+    CHECK(st[0].st_size > room && st[1].st_size <= room, "%lld and %lld bytes, room for %lld", (long long)st[0].st_size,
+          (long long)st[1].st_size, room);
+}
+
 /* ---------------------------------------------------------------- people */
 
 /* The page says no name and no clip, and is the same for one seed. */
@@ -558,6 +580,7 @@ int main(int argc, char **argv)
         cmocka_unit_test(test_answers),
         cmocka_unit_test(test_without_frame_0),
         cmocka_unit_test(test_codec),
+        cmocka_unit_test(test_report_size),
         cmocka_unit_test(test_variants),
         cmocka_unit_test(test_no_variants),
     };

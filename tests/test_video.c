@@ -27,7 +27,9 @@ static void put(dar_video_codec codec, int frames)
 {
     dar_video *v;
     dar_err e;
-    ok(dar_video_create(&v, path, W, H, &(dar_video_how){ 12.5, codec, "how it was made" }, &e), &e);
+    ok(dar_video_create(&v, path, W, H, &(dar_video_how){ .fps = 12.5, .codec = codec, .comment = "how it was made" },
+                        &e),
+       &e);
     for (int t = 0; t < frames; t++) ok(dar_video_write(v, rgb[t], &e), &e);
     ok(dar_video_commit(v, &e), &e);
     dar_video_close(v);
@@ -90,7 +92,7 @@ static void stop_early(void **state)
     ok(dar_video_read(v, back, &e), &e);
     dar_video_close(v);
     unlink(path);
-    ok(dar_video_create(&v, path, W, H, &(dar_video_how){ 25, DAR_VIDEO_FFV1, NULL }, &e), &e);
+    ok(dar_video_create(&v, path, W, H, &(dar_video_how){ .fps = 25, .codec = DAR_VIDEO_FFV1 }, &e), &e);
     ok(dar_video_write(v, rgb[0], &e), &e);
     dar_video_close(v);
     CHECK(stat(path, &st) != 0, "a video that was not committed is there");
@@ -110,7 +112,9 @@ static void refusals(void **state)
     CHECK(strstr(e.text, "ffprobe ended with status"), "%s", e.text);
     unlink(path);
     CHECK(dar_video_probe(&info, path, &e) != DAR_OK && strstr(e.text, "No such file"), "%s", e.text);
-    CHECK(dar_video_create(&v, path, 3, 4, &(dar_video_how){ 25, DAR_VIDEO_H264, NULL }, &e) == DAR_ERR_USAGE && !v,
+    CHECK(dar_video_create(&v, path, 3, 4, &(dar_video_how){ .fps = 25, .codec = DAR_VIDEO_H264 }, &e) ==
+                  DAR_ERR_USAGE &&
+              !v,
           "odd sides accepted");
 }
 
@@ -144,7 +148,7 @@ static void children(void **state)
     setenv("PATH", scratch_dir, 1);
     for (size_t i = 0; i < DAR_COUNT(row); i++) {
         pretend(row[i].script);
-        dar_status s = dar_video_create(&v, path, W, H, &(dar_video_how){ 25, DAR_VIDEO_FFV1, NULL }, &e);
+        dar_status s = dar_video_create(&v, path, W, H, &(dar_video_how){ .fps = 25, .codec = DAR_VIDEO_FFV1 }, &e);
         for (int t = 0; t < 2000 && s == DAR_OK; t++) s = dar_video_write(v, rgb[t % FRAMES], &e);
         CHECK(s != DAR_OK, "frames went on without a reader");
         CHECK(strstr(e.text, row[i].says) && strstr(e.text, path), "found %s, expected %s", e.text, row[i].says);
