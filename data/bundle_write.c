@@ -162,10 +162,9 @@ static size_t stream_size(const dar_bundle_writer *w, int i)
 /* Encoded frame and chunk of every family. */
 static dar_status make_buffers(dar_bundle_writer *w, dar_err *e)
 {
-    size_t most = 0, bytes = 0;
+    size_t bytes = 0;
     for (int i = 0; i < STREAMS; i++) {
         w->stream[i].size = stream_size(w, i);
-        most += w->stream[i].size;
         bytes += w->stream[i].size + dar_deflate_bound(w->stream[i].size) + 2 * DAR_ALIGN;
     }
     DAR_TRY(dar_arena_init(&w->arena, "bundle", bytes, e));
@@ -174,7 +173,7 @@ static dar_status make_buffers(dar_bundle_writer *w, dar_err *e)
         w->stream[i].data = dar_arena_push(&w->arena, w->stream[i].size);
         w->stream[i].out = dar_arena_push(&w->arena, dar_deflate_bound(w->stream[i].size));
     }
-    return dar_deflate_new(&w->deflate, most, e);
+    return dar_deflate_new(&w->deflate, e);
 }
 
 static dar_status begin(dar_bundle_writer *w, const char *path, dar_err *e)

@@ -1,8 +1,6 @@
-/* deflate.h: streams in zlib's format, deflated by all threads.
+/* deflate.h: streams in zlib's format, deflated side by side.
  *
- * A stream is cut into pieces of a fixed size that know nothing of each other, so the bytes do not depend on the number
- * of threads, and any reader of zlib streams, HDF5's filter among them, reads the whole.  Source: RFC 1950, RFC 1951.
- */
+ * A stream is one thread's, so its bytes depend on nothing but its data.  Source: RFC 1950, RFC 1951. */
 #ifndef DAR_DATA_DEFLATE_H
 #define DAR_DATA_DEFLATE_H
 
@@ -23,8 +21,8 @@ typedef struct dar_deflate dar_deflate;
 
 size_t dar_deflate_bound(size_t size);
 
-/* For streams of up to `most` bytes together.  On failure *out is NULL. */
-dar_status dar_deflate_new(dar_deflate **out, size_t most, dar_err *e);
+/* For as many threads as there are now.  On failure *out is NULL. */
+dar_status dar_deflate_new(dar_deflate **out, dar_err *e);
 void dar_deflate_free(dar_deflate *d); /* accepts NULL */
 
 /* Deflate n streams. */

@@ -1,23 +1,16 @@
-/* inflate.c: unpacking, through ISA-L. */
+/* inflate.c: unpacking, through libdeflate. */
 #include "data/inflate.h"
 
-#include <isa-l/igzip_lib.h>
-#include <stdint.h>
+#include <libdeflate.h>
 
-#include "lib/cpu.h"
+#include "lib/status.h"
 
 bool dar_inflate(const void *in, size_t packed, void *out, size_t size)
 {
-    struct inflate_state z;
-    DAR_ASSERT(packed <= UINT32_MAX && size <= UINT32_MAX, "inflate: %zu bytes to %zu", packed, size);
-    isal_inflate_init(&z);
-    z.crc_flag = ISAL_ZLIB;
-    z.next_in = (unsigned char *)(uintptr_t)in;
-    z.avail_in = (uint32_t)packed;
-    z.next_out = out;
-    z.avail_out = (uint32_t)size;
-    bool whole = isal_inflate_stateless(&z) == ISAL_DECOMP_OK && z.total_out == size;
-    dar_cpu_settle();
+    struct libdeflate_decompressor *z = libdeflate_alloc_decompressor();
+    DAR_ASSERT(z, "inflate: out of memory");
+    bool whole = libdeflate_zlib_decompress(z, in, packed, out, size, NULL) == LIBDEFLATE_SUCCESS;
+    libdeflate_free_decompressor(z);
     return whole;
 }
 

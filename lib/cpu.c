@@ -59,13 +59,6 @@ unsigned dar_cpu_flags(void)
     return in_force;
 }
 
-void dar_cpu_settle(void)
-{
-#if defined __x86_64__
-    if (__builtin_cpu_supports("avx")) __asm__ volatile("vzeroupper");
-#endif
-}
-
 dar_status dar_cpu_parse(const char *text, unsigned *flags, dar_err *e)
 {
     static const struct {

@@ -22,10 +22,6 @@ void dar_cpu_init(unsigned flags);
 /* The flags in force. */
 unsigned dar_cpu_flags(void);
 
-/* After a call into a library that may leave the upper halves of vector registers in use: whatever is compiled for the
- * lower ones, as most of ours, would run at half its speed from then on. */
-void dar_cpu_settle(void);
-
 /* "none", "avx2", "avx512", "bf16", "vnni" or "all", or several joined by '+', into flags.  A level brings those it is
  * built on. */
 dar_status dar_cpu_parse(const char *text, unsigned *flags, dar_err *e);

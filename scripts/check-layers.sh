@@ -24,7 +24,7 @@ BEGIN {
 
     only["cblas.h"] = "^(lib/gemm|tests/bench_gemm)[.]c$"
     only["cJSON.h"] = "^lib/json[.]c$"
-    only["isa-l/igzip_lib.h"] = "^data/(de|in)flate[.]c$"
+    only["libdeflate.h"] = "^data/(de|in)flate[.]c$"
     only["hdf5.h"] = "^data/h5[.]c$"
     only["openexr.h"] = "^data/exr[.]c$"
     only["png.h"] = "^data/png[.]c$"
