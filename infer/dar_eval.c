@@ -10,7 +10,7 @@
 #include "lib/program.h"
 
 static struct {
-    const char *out, *base, *key;
+    const char *out, *base, *beside, *key;
     dar_eval_codec_files codec;
     dar_arg_list against, lpips, study, answers;
     int align;
@@ -48,6 +48,8 @@ static const dar_option options[] = {
       .help = "weights of its autoencoder" },
     { .name = "base", .placeholder = "NAME", .type = DAR_ARG_TEXT, .target = &o.base,
       .help = "the method that others are compared with, clip by clip (default: the first)" },
+    { .name = "beside", .placeholder = "CSV", .type = DAR_ARG_TEXT, .target = &o.beside,
+      .help = "published figures, in the columns of table.csv, to show beside ours: infer/paper.csv" },
     { .name = "no-reference", .type = DAR_ARG_FLAG, .target = &o.no_reference,
       .help = "without the rows 'repeat frame 0', 'oracle warp' and 'codec'" },
 
@@ -138,6 +140,7 @@ static dar_status find_all(dar_eval *v, const dar_run *r, dar_err *e)
     DAR_TRY(find_base(v, e));
     DAR_TRY(open_weights(v, e));
     v->report = 0.7 * 1e6 * o.size; /* as base64 four thirds, and there are tables */
+    if (o.beside) DAR_TRY(dar_eval_beside_open(v, o.beside, e));
     v->tile = o.no_report ? 0 : o.tile ? (size_t)o.tile : tile_width(v);
     return DAR_OK;
 }
@@ -236,6 +239,7 @@ static void free_all(dar_eval *v)
     dar_eval_codec_close(v->codec);
     free(v->weights);
     dar_sheet_free(&v->sheet);
+    free(v->figure);
     free(v->method);
     free(v->clip);
     free(v->cell);

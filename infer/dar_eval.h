@@ -8,6 +8,7 @@
  *   dar_eval_variant.c   one scene with many references: shape and appearance
  *   dar_eval_table.c     tables as rows of cells: Markdown
  *   dar_eval_paper.c     which tables there are
+ *   dar_eval_beside.c    published figures beside ours
  *   dar_eval_file.c      JSON and CSV
  *   dar_eval_sheet.c     last frames of some clips, methods side by side
  *   dar_eval_page.c      the report in HTML
@@ -109,6 +110,16 @@ typedef struct dar_eval_clip {
     double seen;    /* of reference variants, IoU of the truth's objects, as seen, with their geometry; NAN: unknown */
 } dar_eval_clip;
 
+/* Of table.csv. */
+#define DAR_EVAL_COLUMNS "set,mode,seed,step,split,trajectory,clips,psnr,psnr_lo,psnr_hi,ssim,lpips,flip,templ1,refl1"
+
+/* A published line of it. */
+typedef struct dar_eval_figure {
+    char set[DAR_EVAL_NAME], mode[16], split[DAR_EVAL_NAME], trajectory[DAR_EVAL_NAME];
+    int64_t step; /* -1: none */
+    double v[DAR_EVAL_MEASURES];
+} dar_eval_figure;
+
 typedef struct dar_eval {
     dar_eval_method *method;
     size_t methods;
@@ -119,6 +130,8 @@ typedef struct dar_eval {
     size_t files;                 /* of weights */
     struct dar_eval_codec *codec; /* NULL: no model is given */
     bool align, masked;
+    dar_eval_figure *figure;
+    size_t figures;
     uint64_t seed;
     double *work;    /* [DAR_BOOTSTRAP] */
     double *value;   /* [clips] */
@@ -239,6 +252,13 @@ void dar_eval_sheet_markdown(const dar_eval_sheet *s, FILE *f);
 
 /* All tables that these methods and clips give. */
 void dar_eval_paper(dar_eval *v, dar_eval_sheets *s);
+
+/* Read published figures: a file in the columns of table.csv.  v->figure is the caller's to free, also after a failure.
+ */
+dar_status dar_eval_beside_open(dar_eval *v, const char *path, dar_err *e);
+
+/* Those of this set of clips that have a method of ours. */
+void dar_eval_beside(dar_eval *v, dar_eval_sheets *s, const char *split);
 
 /* ---------------------------------------------------------------- numbers of sets of clips */
 

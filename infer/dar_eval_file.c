@@ -252,7 +252,7 @@ static void put_sweep_line(FILE *f, dar_eval *v, size_t m, const dar_eval_where 
 
 static void put_sweep(FILE *f, dar_eval *v)
 {
-    fputs("set,mode,seed,step,split,trajectory,clips,psnr,psnr_lo,psnr_hi,ssim,lpips,flip,templ1,refl1\n", f);
+    fputs(DAR_EVAL_COLUMNS "\n", f);
     for (size_t m = 0; m < v->methods; m++)
         for (size_t c = 0; c < v->clips; c++) {
             dar_eval_where w = { .set = v->clip[c].set };

@@ -467,6 +467,7 @@ static void tables_of_set(struct paper *p)
     p->span = DAR_EVAL_LAST;
     end_table(p);
     variant_table(p);
+    dar_eval_beside(p->v, p->sheets, p->set);
 }
 
 void dar_eval_paper(dar_eval *v, dar_eval_sheets *sheets)

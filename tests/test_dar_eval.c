@@ -418,6 +418,32 @@ static void test_names(void **state)
           "%s", text);
 }
 
+/* Published figures stand beside the method of the same channels at the same part of its steps, and no other. */
+static void test_beside(void **state)
+{
+    static const char published[] =
+        "set,mode,seed,step,split,trajectory,clips,psnr,psnr_lo,psnr_hi,ssim,lpips,flip,templ1,refl1\n"
+        "world+tracking+normal,,,10000,4d_vis,all,68,23.22,,,0.895,0.134,,9.10,38.77\n"
+        "tracking+normal+depth,,,10000,4d_vis,all,68,21.80,,,0.861,0.157,,10.12,43.13\n"
+        "dar,,,2000,4d_vis,all,68,1.23,,,,,,,\n"
+        "depth,,,10000,4d_vis,all,68,1.23,,,,,,,\n"
+        "dar,,,10000,ood34,all,34,1.23,,,,,,,\n";
+    (void)state;
+    run_write("published.csv", published, sizeof published - 1);
+    run_write("published.bad", published, sizeof published - 3);
+    GOOD("dar@50=same", "tracking+normal+depth@50=offset", "--against", "set", "-o", "beside", "--no-report",
+         "--beside", "published.csv");
+    char *text = text_of("beside/tables.md");
+    CHECK((text = strstr(text, "## Beside published figures: 4d_vis")), "no table");
+    CHECK(strstr(text, "| dar@50 | all |  |  | 100.00 | 23.22 | 1.000 | 0.895 |  | 0.134 |"), "%s", text);
+    CHECK(strstr(text, "| tracking+normal+depth@50 | all | -") && strstr(text, " | -1.42 | "), "%s", text);
+    CHECK(!strstr(text, "1.23"), "what has no partner is shown: %s", text);
+    BAD(2, "published.bad: line 6: expected set,mode", "same", "--against", "set", "-o", "wrong", "--beside",
+        "published.bad");
+    BAD(2, "line 1: expected set,mode", "same", "--against", "set", "-o", "wrong", "--beside", "set/manifest.json");
+    assert_false(run_is_there("wrong"));
+}
+
 static void test_threads(void **state)
 {
     (void)state;
@@ -568,21 +594,14 @@ static void test_answers(void **state)
 int main(int argc, char **argv)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(test_known),
-        cmocka_unit_test(test_time),
-        cmocka_unit_test(test_size),
-        cmocka_unit_test(test_missing_clips),
-        cmocka_unit_test(test_refused),
-        cmocka_unit_test(test_names),
-        cmocka_unit_test(test_threads),
-        cmocka_unit_test(test_report),
-        cmocka_unit_test(test_study),
-        cmocka_unit_test(test_answers),
-        cmocka_unit_test(test_without_frame_0),
-        cmocka_unit_test(test_codec),
-        cmocka_unit_test(test_report_size),
-        cmocka_unit_test(test_variants),
-        cmocka_unit_test(test_no_variants),
+        cmocka_unit_test(test_known),    cmocka_unit_test(test_time),
+        cmocka_unit_test(test_size),     cmocka_unit_test(test_missing_clips),
+        cmocka_unit_test(test_refused),  cmocka_unit_test(test_names),
+        cmocka_unit_test(test_beside),   cmocka_unit_test(test_threads),
+        cmocka_unit_test(test_report),   cmocka_unit_test(test_study),
+        cmocka_unit_test(test_answers),  cmocka_unit_test(test_without_frame_0),
+        cmocka_unit_test(test_codec),    cmocka_unit_test(test_report_size),
+        cmocka_unit_test(test_variants), cmocka_unit_test(test_no_variants),
     };
     (void)argc;
     if (!run_find(program, argv[0], "dar-eval") || !run_find(bundler, argv[0], "dar-bundle")) return 1;
