@@ -51,7 +51,7 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
 .PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit bench-vae bench-weights
-.PHONY: bench-train demo pretrain ulp fuzz fuzz-run
+.PHONY: bench-train demo pretrain sweep ulp fuzz fuzz-run
 .PHONY: deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -159,6 +159,10 @@ demo: deps ## scenes rendered, trained on, measured with the shipped weights; ME
 pretrain: deps ## the weights of models/dar-tiny from nothing, seeded, some 3 hours; cut it and it goes on
 	@$(MAKE) --no-print-directory -j$(JOBS) all
 	@BIN=$B scripts/pretrain.sh
+
+sweep: deps ## the paper's ablation, SCALE=smoke|small|paper, SETS="dar depth": out/sweep/SCALE; cut it and it goes on
+	@$(MAKE) --no-print-directory -j$(JOBS) all
+	@$(if $(SCALE),SCALE='$(SCALE)') $(if $(SETS),SETS='$(SETS)') BIN=$B scripts/sweep.sh
 
 everything: all $(TESTS:%=$B/%) $B/bench_kernels $(SPEED:%=$B/%) $B/ulp
 

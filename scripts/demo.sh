@@ -53,7 +53,7 @@ evaluate() {
     to=$1
     shift
     [ -f "$to/report.html" ] && [ -z "$(find "$OUT" -name sample.json -newer "$to/report.html")" ] && return
-    "$BIN/dar-eval" "$@" -o "$to" --overwrite >"$to.txt"
+    "$BIN/dar-eval" "$@" --model "$MODEL/backbone" -o "$to" --overwrite >"$to.txt"
     cat "$to.txt"
 }
 

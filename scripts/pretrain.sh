@@ -10,7 +10,8 @@ BIN=${BIN:-build/release}
 DATA=${DATA:-out/data}
 OUT=${OUT:-out/pretrain}
 MODEL=${MODEL:-models/dar-tiny}
-CLIPS=${CLIPS:-1200}
+CLIPS=${CLIPS:-1200}    # to learn from
+HELD=${HELD:-68}        # to look at
 SET=${SET:-}            # options of dar-bundle synth
 KEYS=${KEYS:-}
 
@@ -79,11 +80,11 @@ results() {
 }
 
 mkdir -p "$DATA" "$OUT"
-say "1 of 5: $CLIPS scenes to learn from, 68 to look at"
+say "1 of 5: $CLIPS scenes to learn from, $HELD to look at"
 # shellcheck disable=SC2086
 "$BIN/dar-bundle" synth -o "$DATA/train" --count "$CLIPS" $SET
 # shellcheck disable=SC2086
-"$BIN/dar-bundle" synth -o "$DATA/4d_vis" --set 4d_vis $SET
+"$BIN/dar-bundle" synth -o "$DATA/4d_vis" --set 4d_vis --count "$HELD" $SET
 
 say "2 of 5: the autoencoder"
 stage vae vae
