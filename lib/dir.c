@@ -198,6 +198,32 @@ dar_status dar_dir_remove(const char *path, dar_err *e)
     return remove_tree(moved ? gone : path) == 0 ? DAR_OK : refused(path, errno, e);
 }
 
+static dar_status link_entry(const char *from, const char *to, dar_err *e)
+{
+    struct stat st;
+    if (lstat(from, &st) != 0) return refused(from, errno, e);
+    if (S_ISDIR(st.st_mode)) return dar_dir_link(from, to, e);
+    return link(from, to) == 0 ? DAR_OK : refused(to, errno, e);
+}
+
+dar_status dar_dir_link(const char *from, const char *to, dar_err *e)
+{
+    char a[PATH_MAX], b[PATH_MAX];
+    dar_status s = DAR_OK;
+    DIR *d = opendir(from);
+    if (!d) return refused(from, errno, e);
+    if (mkdir(to, 0777) != 0) s = refused(to, errno, e);
+    for (const struct dirent *x; s == DAR_OK && (x = readdir(d));) {
+        if (strcmp(x->d_name, ".") == 0 || strcmp(x->d_name, "..") == 0) continue;
+        if (snprintf(a, sizeof a, "%s/%s", from, x->d_name) >= (int)sizeof a ||
+            snprintf(b, sizeof b, "%s/%s", to, x->d_name) >= (int)sizeof b)
+            s = refused(to, ENAMETOOLONG, e);
+        else s = link_entry(a, b, e);
+    }
+    closedir(d);
+    return s;
+}
+
 dar_status dar_dir_lock(int *fd, const char *path, dar_err *e)
 {
     bool locked;

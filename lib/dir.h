@@ -38,6 +38,10 @@ void dar_dir_discard(dar_dir_out *o);
  * its own. */
 dar_status dar_dir_remove(const char *path, dar_err *e);
 
+/* Make the directory `to`, which is not there, on the same file system, and give every file below `from` a name below
+ * it too (a hard link): no bytes are copied, and what is removed at one of them stays at the other. */
+dar_status dar_dir_link(const char *from, const char *to, dar_err *e);
+
 /* Hold an existing directory: only one program at a time can.  close(*fd) gives it back; on failure *fd is -1. */
 dar_status dar_dir_lock(int *fd, const char *path, dar_err *e);
 

@@ -347,9 +347,18 @@ static void exported(void **state)
     GOOD("lora.json", SET("model=moved/backbone"), SET("output_dir=again"), SET("max_train_steps=1"));
     GOOD("lora.json", SET("model=moved"), SET("output_dir=further"), SET("max_train_steps=1"));
 
+    assert_int_equal(mkdir("moved/results", 0777), 0);
+    assert_int_equal(mkdir("moved/results/plots", 0777), 0);
+    run_write("moved/results/table.csv", "told", 4);
+    run_write("moved/results/plots/loss.svg", "drawn", 5);
     GOOD("backbone/checkpoint-20", "--export", "moved");
     same_rounded("backbone/checkpoint-20", "moved");
     CHECK(!run_is_there("moved/lora.safetensors"), "what was replaced is there");
+    char text[8];
+    run_read("moved/results/table.csv", text, sizeof text);
+    assert_string_equal(text, "told");
+    run_read("moved/results/plots/loss.svg", text, sizeof text);
+    assert_string_equal(text, "drawn");
     BAD(2, "clips", "give/checkpoint-5", "--export", "clips");
     CHECK(run_is_there("clips/a/meta.json"), "what is no model was replaced");
     BAD(2, "no-model", "no-model", "--export", "bad");

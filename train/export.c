@@ -13,6 +13,7 @@
 #include "models/model.h"
 
 #define NETWORK (DAR_PARAM_BASE | DAR_PARAM_ADAPTER)
+#define RESULTS "results"
 
 /* A directory that is being written. */
 typedef struct place {
@@ -171,6 +172,14 @@ static dar_status write_model(place *at, const char *checkpoint, dar_dtype stora
     return s;
 }
 
+/* What is known about a model outlives an exchange of its weights. */
+static dar_status keep_results(place *at, const char *out, dar_err *e)
+{
+    char from[PATH_MAX + 64];
+    snprintf(from, sizeof from, "%s/" RESULTS, out);
+    return is_there(out, RESULTS "/.") ? dar_dir_link(from, name(at, RESULTS), e) : DAR_OK;
+}
+
 static dar_status replace(const char *checkpoint, const char *out, dar_dtype storage, bool merge, size_t *bytes,
                           dar_err *e)
 {
@@ -181,6 +190,7 @@ static dar_status replace(const char *checkpoint, const char *out, dar_dtype sto
         snprintf(at.directory, sizeof at.directory, "%s", dir.temp);
         s = write_model(&at, checkpoint, storage, merge, e);
     }
+    if (s == DAR_OK) s = keep_results(&at, out, e);
     if (s == DAR_OK) s = dar_dir_commit(&dir, is_there(out, "model.json"), e);
     dar_dir_discard(&dir);
     if (s == DAR_OK && bytes) *bytes = at.bytes;

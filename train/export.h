@@ -16,8 +16,9 @@
 #include "lib/dtype.h"
 #include "lib/status.h"
 
-/* Fails if `out` is there and is no model; a model is replaced, with all that lies beside it, in one moment.  *bytes,
- * which may be NULL: of the weights that were written. */
+/* Fails if `out` is there and is no model; a model is replaced, with all that lies beside it, in one moment; only its
+ * directory results, where scripts put what was measured, stays.  *bytes, which may be NULL: of the weights that were
+ * written. */
 dar_status dar_export(const char *checkpoint, const char *out, dar_dtype storage, size_t *bytes, dar_err *e);
 
 /* Write OUT/dit.safetensors, under the public names, with additions and adapter put into the weights, and
