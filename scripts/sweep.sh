@@ -3,8 +3,8 @@
 # fifths of its steps; rendered and measured on five sets of scenes that were not in training; the paper's tables.  Cut
 # it at any moment and start it again: what is done is kept.
 #
-#   SCALE=smoke   whether all of it works: minutes
-#         small   models/dar-tiny: hours
+#   SCALE=smoke   whether all of it works: a quarter of an hour
+#         small   models/dar-tiny: four hours
 #         paper   the 5B network: configurations, memory and time of each; trained only where WEIGHTS and memory are
 #   SETS="dar depth dar:full"    channel sets (data/condition.h), :full trains all of the network
 #   SEEDS="0 1 2"   KEYS="condition.geometry_frame=scene"   with OUT of their own, or they would be mixed with others
@@ -21,10 +21,11 @@ SETS=${SETS:-camera depth tracking normal world tracking+normal tracking+world n
     tracking+normal+depth dar mask+world+normal mask+depth+normal dar:full}
 FIFTHS=${FIFTHS:-dar tracking+normal+depth mask+world+normal mask+depth+normal dar:full} # measured at every fifth
 
-# Splits, and how many clips of each; 0: all.
+# Splits, and how many clips of each; 0: all.  A step of the small model takes about a second on two cores, as does a
+# render in 10 steps: 15 trainings are 5 minutes (smoke) or 100 (small), the 3800 renders of small some 70.
 case $SCALE in
 smoke) steps=20 clips=16 few="4d_vis=4 ood34=2 refvar=2 motion-separation=2 correspondence=2" sample="--steps 4" ;;
-small) steps=1500 clips=1200 sample="--steps 20" ;;
+small) steps=400 clips=1200 sample="--solver ab2 --steps 10" ;;
 paper) steps=10000 clips=1000 sample="--weights $WEIGHTS" ;;
 *) echo "sweep: SCALE: found '$SCALE', expected smoke, small or paper" >&2 && exit 2 ;;
 esac
