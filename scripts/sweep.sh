@@ -25,7 +25,7 @@ FIFTHS=${FIFTHS:-dar tracking+normal+depth mask+world+normal mask+depth+normal d
 # render in 10 steps: 15 trainings are 5 minutes (smoke) or 100 (small), the 3800 renders of small some 70.
 case $SCALE in
 smoke) steps=20 clips=16 few="4d_vis=4 ood34=2 refvar=2 motion-separation=2 correspondence=2" sample="--steps 4" ;;
-small) steps=400 clips=1200 sample="--solver ab2 --steps 10" ;;
+small) steps=300 clips=1200 sample="--solver ab2 --steps 10" ;;
 paper) steps=10000 clips=1000 sample="--weights $WEIGHTS" ;;
 *) echo "sweep: SCALE: found '$SCALE', expected smoke, small or paper" >&2 && exit 2 ;;
 esac
