@@ -78,7 +78,7 @@ static void legend(void **state)
     enum { N = 14 };
     static const double v[] = { 1, 2 };
     dar_plot_series s[N];
-    char label[N][24];
+    char label[N][40];
     for (int i = 0; i < N; i++) {
         snprintf(label[i], sizeof label[i], "%d-%.*s", i, 15 - i % 5 * 3, "MMMMMMMMMMMMMMMMMMM");
         s[i] = (dar_plot_series){ .label = label[i], .colour = i, .n = 2, .x = v, .y = v };
@@ -87,7 +87,7 @@ static void legend(void **state)
     char *svg = text_of(&p);
     double end = 0, row = 0;
     for (int i = 0; i < N; i++) {
-        char text[40];
+        char text[56];
         double x = NAN, y = NAN;
         snprintf(text, sizeof text, ">%s</text>", label[i]);
         const char *at = strstr(svg, text);
