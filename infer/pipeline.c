@@ -10,6 +10,8 @@
 #include "models/encode.h"
 #include "models/load.h"
 
+const char *const dar_pipeline_precision[] = { "f64", "f32", "bf16", "int8", NULL };
+
 /* ---------------------------------------------------------------- what comes from files */
 
 static dar_status read_prompts(dar_pipeline *p, dar_err *e)

@@ -12,6 +12,10 @@
 #include "models/model.h"
 #include "models/sampler.h"
 
+/* How numbers are kept, by name: the first of dar_dtype, and "int8": bf16, products of the middle blocks of 8 bits. */
+#define DAR_PIPELINE_INT8 3
+extern const char *const dar_pipeline_precision[DAR_PIPELINE_INT8 + 2]; /* "f64", "f32", "bf16", "int8", NULL */
+
 typedef struct dar_pipeline_options {
     dar_sampler_config sampler;
     dar_noise noise;

@@ -289,6 +289,14 @@ static dar_status check_finite(const dar_solver *solver, const dar_tensor *v, da
                     solver->step + 1, solver->steps, solver->sigma[solver->step], (long long)i);
 }
 
+/* Steps of one point add to the estimate too, but Euler's. */
+static dar_status check_budget(const dar_solver *s, dar_err *e)
+{
+    if (!(s->budget > 0) || s->estimate <= s->budget * (1 + 1e-9)) return DAR_OK;
+    return dar_fail(e, DAR_ERR_CHECK, "step %zu of %zu: the estimated error is %.3g, expected at most %.3g", s->step,
+                    s->steps, s->estimate, s->budget);
+}
+
 /* Of a first frame that is held nothing changes. */
 static void hold_still(const dar_tensor *v)
 {
@@ -321,6 +329,7 @@ static dar_status run_steps(dar_sampler *s, struct run *r, const dar_tensor *fir
         if (told) dar_flow_combine(2, to_clean, (const dar_tensor *const[]){ z, v }, &r->clean);
         if (told && first) dar_dit_hold_first(&r->clean, first);
         dar_solver_step(&solver, v, z);
+        DAR_TRY(check_budget(&solver, e));
         if (first) dar_dit_hold_first(z, first);
         if (told) DAR_TRY(told(ctx, solver.step, z, &r->clean, e));
     }

@@ -105,7 +105,8 @@ typedef dar_status dar_sampler_told(void *ctx, size_t done, const dar_tensor *z,
  *
  * known [1, mask + latent, F, h, w] (dar_dit_known), or NULL: nothing is.  first, whose first frame z's keeps, and
  * whose time is then 0, or NULL.  May be called again, for the same clip with another picture or noise.
- * DAR_ERR_NUMERIC: the velocity of a step is not finite. */
+ * DAR_ERR_NUMERIC: the velocity of a step is not finite.  DAR_ERR_CHECK: the estimated error exceeds the solver's
+ * budget. */
 dar_status dar_sampler_run(dar_sampler *s, const dar_tensor *known, const dar_tensor *first, const dar_tensor *z,
                            dar_sampler_told *told, void *ctx, dar_err *e);
 

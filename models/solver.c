@@ -140,7 +140,7 @@ dar_solver_config dar_solver_default(void)
 void dar_solver_init(dar_solver *s, const dar_solver_config *c, const dar_tensor *z, dar_arena *a)
 {
     const method *m = &methods[c->kind];
-    *s = (dar_solver){ .kind = c->kind, .steps = c->steps, .tolerance = c->tolerance, .most = 1 };
+    *s = (dar_solver){ .kind = c->kind, .steps = c->steps, .tolerance = c->tolerance, .budget = c->budget, .most = 1 };
     s->models = m->models[c->tolerance > 0];
     s->sigma = dar_arena_push(a, dar_mul_size(c->steps + 1, sizeof(double)));
     s->time = dar_arena_push(a, dar_mul_size(c->steps, sizeof(double)));
@@ -251,7 +251,8 @@ static size_t choose(dar_solver *s, const method *m, const dar_tensor *z)
     size_t to = here + 1;
     if (s->tolerance <= 0) return to;
     if (n > 1) s->spread = spread_of(s, n, z);
-    while (n > 1 && to < s->steps && to - here < s->most && estimate(s, m, n, to + 1) <= s->tolerance) to++;
+    const double left = s->budget > 0 ? s->budget - s->estimate : INFINITY, most = fmin(s->tolerance, left);
+    while (n > 1 && to < s->steps && to - here < s->most && estimate(s, m, n, to + 1) <= most) to++;
     s->last = estimate(s, m, n, to);
     s->estimate += s->last;
     s->most = 2 * (to - here);

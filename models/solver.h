@@ -52,6 +52,7 @@ typedef struct dar_solver_config {
     size_t steps;
     double shift;
     double tolerance; /* T; 0: every point of the grid is called */
+    double budget;    /* of `estimate`: a step that would take it beyond goes to the next point; 0: none */
 } dar_solver_config;
 
 /* Euler on its grid, 50 steps, shift 5. */
@@ -61,7 +62,7 @@ dar_solver_config dar_solver_default(void);
 
 typedef struct dar_solver {
     dar_solver_kind kind;
-    double tolerance;
+    double tolerance, budget;
     size_t steps, step;     /* of the grid; step: where the network is called next */
     size_t calls, rejected; /* calls so far; of them for steps that were taken back */
     double estimate;        /* sum over the steps of how far the order below would have gone elsewhere, relative to z */
