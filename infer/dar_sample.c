@@ -1,11 +1,13 @@
 /* dar_sample.c: the program dar-sample: bundles, a picture and a model in, videos out. */
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
 
 #include "data/pictures.h"
+#include "infer/front.h"
 #include "infer/output.h"
 #include "infer/pipeline.h"
 #include "infer/preview.h"
@@ -17,9 +19,9 @@
 #define MOST 1000 /* bundles of one call */
 
 static struct {
-    const char *out, *model, *weights, *part[DAR_MODEL_PARTS], *channels, *noise, *text, *negative;
+    const char *out, *model, *weights, *part[DAR_MODEL_PARTS], *channels, *noise, *text, *negative, *front;
     int64_t steps;
-    double guidance, shift, strength, tolerance, guidance_tolerance;
+    double guidance, shift, strength, tolerance, guidance_tolerance, error_budget;
     int solver, grid, precision, skip;
     int64_t window, overlap;
     dar_arg_list references, no_skip;
@@ -27,8 +29,6 @@ static struct {
     dar_common common;
 } o = { .overlap = -1 };
 
-static const char *const precision_names[] = { "f64", "f32", "bf16", "int8", NULL }; /* dar_dtype, but for the last */
-#define EIGHT 3
 static const char *const skip_names[] = { "none", "exact", NULL };
 static const char *const grid_names[] = { "even", "twice", "whole", "diffusers", "auto", NULL }; /* dar_flow_grid */
 
@@ -62,7 +62,7 @@ static const dar_option options[] = {
     { .name = "channels", .placeholder = "SET", .type = DAR_ARG_TEXT, .target = &o.channels,
       .help = "what the adapter is given, as dar or world+normal (default: what the model says)" },
     { .name = "precision", .placeholder = "TYPE", .type = DAR_ARG_CHOICE, .target = &o.precision, .standard = "bf16",
-      .names = precision_names, .help = "f64, f32, bf16 (sums are f32), or int8: as bf16, products of the "
+      .names = dar_pipeline_precision, .help = "f64, f32, bf16 (sums are f32), or int8: as bf16, products of the "
       "middle blocks of 8 bits" },
     { .name = "random", .type = DAR_ARG_FLAG, .target = &o.random,
       .help = "weights that have no file are drawn by --seed: to try speed and memory" },
@@ -85,6 +85,11 @@ static const dar_option options[] = {
     { .name = "tolerance", .placeholder = "T", .type = DAR_ARG_NUMBER, .target = &o.tolerance, .standard = "0",
       .lo = 0, .hi = 1, .help = "leave out steps that earlier ones foretell: each may be off by T of the latent "
       "(models/solver.h); 0: none" },
+    { .name = "error-budget", .placeholder = "E", .type = DAR_ARG_NUMBER, .target = &o.error_budget, .standard = "0",
+      .lo = 0, .hi = 1, .help = "choose precision, solver, steps and tolerances: what was measured to be fastest for "
+      "the kind of scene and is off by E of the full run's latent at most (infer/front.h); 0: as these options say" },
+    { .name = "front", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.front,
+      .help = "what was measured (default: front.json beside the model's file)" },
     { .name = "noise", .placeholder = "own|torch|FILE", .type = DAR_ARG_TEXT, .target = &o.noise, .standard = "own",
       .help = "drawn by --seed as this program does, or as torch.randn on a CPU; or a safetensors file" },
     { .name = "text", .placeholder = "FILE", .type = DAR_ARG_TEXT, .target = &o.text,
@@ -126,6 +131,12 @@ struct job {
     char **bundle, **reference; /* names; end with NULL */
     size_t done, kept;
     double prepare; /* [s] of the clip */
+
+    /* With an error budget. */
+    dar_front front;
+    dar_front_kind_name *kind;       /* [bundles] */
+    const dar_front_setting *chosen; /* of the bundle that is being rendered; NULL: the full run */
+    bool fell_back;                  /* its estimate came to too much */
 };
 
 /* ---------------------------------------------------------------- what is asked for */
@@ -195,7 +206,7 @@ static dar_status read_condition(struct job *j, const dar_model_file *f, dar_err
 
 static dar_dtype storage(void)
 {
-    return o.precision == EIGHT ? DAR_BF16 : (dar_dtype)o.precision;
+    return o.precision == DAR_PIPELINE_INT8 ? DAR_BF16 : (dar_dtype)o.precision;
 }
 
 /* --lora DIR: its lora.safetensors, and the adapter that was trained with it, if no other is named. */
@@ -213,18 +224,102 @@ static void find_trained(const char *part[DAR_MODEL_PARTS])
     }
 }
 
+/* ---------------------------------------------------------------- an error budget */
+
+static dar_status look_at_bundles(struct job *j, dar_err *e)
+{
+    const dar_program *p = j->r->program;
+    if (!(j->kind = calloc((size_t)p->rests, sizeof *j->kind)))
+        return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", o.out);
+    for (int i = 0; i < p->rests; i++) {
+        dar_front_scene scene;
+        dar_bundle *b;
+        DAR_TRY(dar_bundle_open(&b, p->rest[i], e));
+        dar_status s = dar_front_look(&scene, b, e);
+        dar_bundle_close(b);
+        DAR_TRY(s);
+        j->kind[i] = dar_front_kind_of(&j->front, &scene);
+    }
+    return DAR_OK;
+}
+
+/* All bundles are rendered by one model, in the precision in which that costs least; in f32 the full run always may. */
+static dar_status choose_precision(struct job *j, const dar_model_file *f, dar_err *e)
+{
+    char path[PATH_MAX];
+    double least = INFINITY;
+    const char *slash = strrchr(f->path, '/');
+    if (!(o.error_budget > 0)) return DAR_OK;
+    if (snprintf(path, sizeof path, "%.*sfront.json", slash ? (int)(slash + 1 - f->path) : 0, f->path) >= PATH_MAX)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", f->path);
+    DAR_TRY(dar_front_open(&j->front, o.front ? o.front : path, f->c.name, e));
+    DAR_TRY(look_at_bundles(j, e));
+    for (int p = 0; p <= DAR_PIPELINE_INT8; p++) {
+        double time = 0;
+        for (int i = 0; i < j->r->program->rests; i++) {
+            const dar_front_setting *s = dar_front_pick(&j->front, j->kind[i], p, o.error_budget);
+            time += s ? s->time : p == DAR_F32 ? 1 : INFINITY;
+        }
+        if (!(time < least)) continue;
+        least = time;
+        o.precision = p;
+    }
+    return DAR_OK;
+}
+
+/* The full run is the paper's, but for guidance, shift and skips, which stay as they were asked for. */
+static void choose_setting(struct job *j, int bundle)
+{
+    if (!(o.error_budget > 0)) return;
+    dar_sampler_config full = dar_sampler_default();
+    full.guidance = o.guidance;
+    full.solver.shift = o.shift;
+    full.skip = j->how.sampler.skip;
+    j->how.sampler = full;
+    j->fell_back = false;
+    j->chosen = dar_front_pick(&j->front, j->kind[bundle], o.precision, o.error_budget);
+    if (j->chosen) dar_front_apply(&j->front, j->chosen, &j->how.sampler);
+}
+
+/* What was chosen and what came of it. */
+static void tell_choice(struct job *j, const char *path, const dar_sampler *ran, int bundle)
+{
+    const dar_front_setting *s = j->chosen;
+    dar_json_writer *w = &j->r->json;
+    if (!(o.error_budget > 0)) return;
+    dar_json_write_object(w, "error_budget");
+    dar_json_write_number(w, "budget", o.error_budget);
+    dar_json_write_text(w, "kind", dar_front_kind[j->kind[bundle]]);
+    dar_json_write_text(w, "setting", s ? s->name : "full");
+    dar_json_write_bool(w, "fell_back", j->fell_back);
+    if (s) dar_json_write_number(w, "bound", j->front.safety * s->error);
+    if (s) dar_json_write_number(w, "estimate_allowed", j->front.safety * s->estimate);
+    dar_json_write_end(w);
+    if (!s)
+        dar_run_say(j->r, "%s: no setting for '%s' is known to be within %g: the full run", path,
+                    dar_front_kind[j->kind[bundle]], o.error_budget);
+    else if (j->fell_back)
+        dar_run_say(j->r, "%s: the estimated error of %s came to more than it ever did: 50 steps of euler", path,
+                    s->name);
+    else
+        dar_run_say(
+            j->r, "%s: %s, %.2f of the full run's time, error at most %.2g of %g; estimated %.2g of %.2g allowed", path,
+            s->name, s->time, j->front.safety * s->error, o.error_budget, ran->estimate, j->front.safety * s->estimate);
+}
+
 static dar_status open_model(struct job *j, dar_err *e)
 {
     dar_model_options m = { .weights = o.weights, .strength = o.strength, .plan = o.common.dry_run };
     dar_model_file f;
     memcpy(m.part, o.part, sizeof m.part);
     find_trained(m.part);
+    dar_status s = dar_model_file_open(&f, o.model, e);
+    if (s == DAR_OK) s = choose_precision(j, &f, e);
     m.storage = storage();
-    m.eight = o.precision == EIGHT;
+    m.eight = o.precision == DAR_PIPELINE_INT8;
     m.random = o.random, m.seed = o.common.seed;
     m.preview = o.preview;
     m.apart = !(j->how.sampler.skip >> DAR_SKIP_LORA & 1);
-    dar_status s = dar_model_file_open(&f, o.model, e);
     if (s == DAR_OK) s = read_condition(j, &f, e);
     if (s == DAR_OK) s = dar_model_open(&j->m, &f, &m, e);
     dar_model_file_close(&f);
@@ -308,13 +403,14 @@ static dar_status print_hashed(dar_json_writer *w, const char *key, const char *
 static void print_sampler(dar_json_writer *w, const struct job *j)
 {
     const dar_sampler_config *c = &j->how.sampler;
-    dar_json_write_text(w, "precision", precision_names[o.precision]);
+    dar_json_write_text(w, "precision", dar_pipeline_precision[o.precision]);
     dar_json_write_int(w, "steps", (int64_t)c->solver.steps);
     dar_json_write_number(w, "guidance", c->guidance);
     if (c->guidance_tolerance > 0) dar_json_write_number(w, "guidance_tolerance", c->guidance_tolerance);
     dar_json_write_number(w, "shift", c->solver.shift);
     dar_json_write_text(w, "solver", dar_solver_name[c->solver.kind]);
     if (c->solver.tolerance > 0) dar_json_write_number(w, "tolerance", c->solver.tolerance);
+    if (c->solver.budget > 0) dar_json_write_number(w, "estimate_allowed", c->solver.budget);
     dar_json_write_text(w, "grid", dar_flow_grid_name[c->solver.grid]);
     dar_json_write_text(w, "noise", j->how.noise_file ? "file" : o.noise);
     if (!j->how.noise_file) {
@@ -382,6 +478,7 @@ struct hearing {
     const char *path;
     dar_progress progress;
     double begun, ended[3]; /* [s] of the stages */
+    size_t steps;
 };
 
 static dar_status hear_frame(void *ctx, size_t index, const uint8_t *rgb, dar_err *e)
@@ -394,14 +491,14 @@ static dar_status hear_step(void *ctx, size_t done, const dar_tensor *z, const d
 {
     struct hearing *h = ctx;
     if (h->preview.v) DAR_TRY(dar_preview_show(&h->preview, done, clean, e));
-    return o.latent && done == (size_t)o.steps ? dar_output_latent(h->output, z, e) : DAR_OK;
+    return o.latent && done == h->steps ? dar_output_latent(h->output, z, e) : DAR_OK;
 }
 
 static dar_status hear_stage(void *ctx, dar_pipeline_stage stage, size_t done, size_t of, dar_err *e)
 {
     static const char *const what[] = { "encoding", "sampling", "decoding" };
     struct hearing *h = ctx;
-    size_t steps = stage == DAR_PIPELINE_SAMPLE ? done : stage == DAR_PIPELINE_DECODE ? (size_t)o.steps : 0;
+    size_t steps = stage == DAR_PIPELINE_SAMPLE ? done : stage == DAR_PIPELINE_DECODE ? h->steps : 0;
     char note[64];
     snprintf(note, sizeof note, "%s %zu of %zu", what[stage], done, of);
     dar_progress_step(&h->progress, (double)steps, note);
@@ -455,7 +552,7 @@ static dar_status begin_preview(struct hearing *h, const dar_pipeline *p, dar_er
     while (n > 1 && h->path[n - 1] == '/') n--;
     if (snprintf(path, sizeof path, "%.*s.preview.png", (int)n, h->path) >= PATH_MAX)
         return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", h->path);
-    return dar_preview_init(&h->preview, &p->m->taew, latent_of(p), (size_t)o.steps, path, e);
+    return dar_preview_init(&h->preview, &p->m->taew, latent_of(p), h->steps, path, e);
 }
 
 static void end_preview(struct hearing *h)
@@ -469,9 +566,9 @@ static dar_status render(struct job *j, dar_pipeline *p, const char *path, const
 {
     const dar_output_options files = { !o.no_png, o.exr, !o.no_mp4, o.mkv, !o.no_sheet, o.eval, o.overwrite };
     const dar_output_shown shown = { &j->condition, &p->cond, rgb };
-    struct hearing h = { .path = path, .begun = dar_log_clock() };
+    struct hearing h = { .path = path, .begun = dar_log_clock(), .steps = p->o.sampler.solver.steps };
     const dar_pipeline_listener listener = { hear_frame, hear_stage, hear_step, &h };
-    h.progress = dar_progress_begin(path, "steps", (double)o.steps);
+    h.progress = dar_progress_begin(path, "steps", (double)h.steps);
     dar_status s = dar_output_create(&h.output, path, p->b, &shown, settings, &files, e);
     if (s == DAR_OK) s = begin_preview(&h, p, e);
     if (s == DAR_OK) s = dar_pipeline_render(p, rgb, &listener, e);
@@ -481,6 +578,20 @@ static dar_status render(struct job *j, dar_pipeline *p, const char *path, const
     dar_output_discard(h.output);
     if (s == DAR_OK) tell_video(j, p, &h);
     return s;
+}
+
+/* This clip is unlike those that were measured: the model's own precision, every step of Euler. */
+static dar_status fall_back(struct job *j, const char *in, dar_bundle *b, dar_pipeline **p, dar_err *e)
+{
+    dar_pipeline_options how = j->how;
+    const dar_solver_config *asked = &j->how.sampler.solver;
+    how.sampler.solver = dar_solver_default();
+    how.sampler.solver.shift = asked->shift;
+    how.sampler.guidance_tolerance = 0;
+    j->fell_back = true;
+    dar_pipeline_close(*p);
+    *p = NULL;
+    return dar_pipeline_open(p, j->m, &j->condition, in, b, &how, e);
 }
 
 /* One reference of a bundle; *p is made when it is first needed. */
@@ -503,15 +614,26 @@ static dar_status make_video(struct job *j, int bundle, dar_bundle *b, size_t i,
         return dar_fail(e, DAR_ERR_USAGE, "%s: found something made otherwise, expected --overwrite or another -o",
                         path);
     dar_status s = load_reference(b, reference, in, &rgb, e);
+    if (j->fell_back) { /* for another picture, which is tried as if it were alone */
+        dar_pipeline_close(*p);
+        *p = NULL;
+        j->fell_back = false;
+    }
     if (s == DAR_OK && !*p) {
         double begun = dar_log_clock();
         s = dar_pipeline_open(p, j->m, &j->condition, in, b, &j->how, e);
         j->prepare = dar_log_clock() - begun;
     }
     if (s == DAR_OK) s = render(j, *p, path, rgb, settings, e);
+    if (s == DAR_ERR_CHECK && o.error_budget > 0) {
+        s = fall_back(j, in, b, p, e);
+        if (s == DAR_OK) s = render(j, *p, path, rgb, settings, e);
+    }
     free(rgb);
-    if (s == DAR_OK) j->done++;
-    return s;
+    if (s != DAR_OK) return s;
+    tell_choice(j, path, &(*p)->sampler, bundle);
+    j->done++;
+    return DAR_OK;
 }
 
 /* ---------------------------------------------------------------- a bundle */
@@ -578,6 +700,7 @@ static dar_status sample_bundle(struct job *j, int bundle, dar_err *e)
     dar_bundle *b;
     DAR_TRY(dar_bundle_open(&b, path, e));
     dar_json_write_text(&j->r->json, "bundle", path);
+    choose_setting(j, bundle);
     dar_status s = o.common.dry_run ? dar_pipeline_open(&p, j->m, &j->condition, path, b, &j->how, e)
                                     : make_videos(j, bundle, b, &p, e);
     if (p) tell_plan(j, p, path);
@@ -614,6 +737,8 @@ static dar_status sample(dar_run *r, dar_err *e)
     if (s == DAR_OK) s = open_model(&j, e);
     if (s == DAR_OK) s = sample_all(&j, e);
     dar_model_close(j.m);
+    dar_front_close(&j.front);
+    free(j.kind);
     free_names(j.bundle);
     free_names(j.reference);
     return s;

@@ -674,6 +674,63 @@ static int in_directory(void **state)
     return 0;
 }
 
+/* ---------------------------------------------------------------- an error budget */
+
+static void write_front(const char *model_name, const char *solver, int steps, double tolerance, double estimate)
+{
+    char text[1024];
+    int n = snprintf(text, sizeof text,
+                     "{\"format\": \"dar-front/1\", \"model\": \"%s\", \"safety\": 2, \"kinds\": [{\"name\": "
+                     "\"any\", \"scenes\": 3, \"visible\": [0, 1], \"settings\": [{\"name\": \"made\", "
+                     "\"precision\": \"f32\", \"solver\": \"%s\", \"steps\": %d, \"tolerance\": %g, "
+                     "\"guidance_tolerance\": 0, \"time\": 0.1, \"error\": 0.01, \"estimate\": %g, \"psnr\": 40}]}]}",
+                     model_name, solver, steps, tolerance, estimate);
+    run_write("model/front.json", text, (size_t)n);
+}
+
+#define BUDGET(out, e)                                                                                                 \
+    "clip", "-o", out, "--model", "model", "--no-mp4", "--reference", "a.png", "--error-budget", e, "--json"
+
+static bool said(const char *words)
+{
+    return strstr(ran.out, words) != NULL;
+}
+
+static void budgets(void **state)
+{
+    (void)state;
+    remove("model/front.json");
+    BAD(2, "front.json", BUDGET("b0", "0.02"));
+    write_front("other", "ab2", 4, 1e-12, 1e6);
+    BAD(2, "expected \"small\"", BUDGET("b0", "0.02"));
+
+    /* Twice the error is the bound. */
+    write_front("small", "ab2", 4, 1e-12, 1e6);
+    GOOD(BUDGET("b1", "0.02"));
+    CHECK(said("\"setting\": \"made\"") && said("\"fell_back\": false"), "%s", ran.out);
+    GOOD("clip", "-o", "b2", "--model", "model", "--no-mp4", "--reference", "a.png", "--precision", "f32", "--solver",
+         "ab2", "--steps", "4");
+    same_frames("b1", "b2");
+    GOOD(BUDGET("b3", "0.019"));
+    CHECK(said("\"setting\": \"full\""), "%s", ran.out);
+    GOOD("clip", "-o", "b4", "--model", "model", "--no-mp4", "--reference", "a.png", "--precision", "f32");
+    same_frames("b3", "b4");
+    assert_true(frames_differ("b1", "b3"));
+
+    /* A run that is estimated to be off by more than any was is done again; Euler's goes on without long steps. */
+    write_front("small", "ab2", 4, 1e-12, 1e-9);
+    GOOD(BUDGET("b5", "0.02"));
+    CHECK(said("\"fell_back\": true"), "%s", ran.out);
+    same_frames("b5", "b4");
+    write_front("small", "euler", 50, 1, 1e6);
+    GOOD(BUDGET("b6", "0.02"));
+    assert_true(frames_differ("b6", "b4"));
+    write_front("small", "euler", 50, 1, 1e-30);
+    GOOD(BUDGET("b7", "0.02"));
+    CHECK(said("\"fell_back\": false"), "%s", ran.out);
+    same_frames("b7", "b4");
+}
+
 int main(int argc, char **argv)
 {
     static const struct CMUnitTest tests[] = {
@@ -681,7 +738,7 @@ int main(int argc, char **argv)
         cmocka_unit_test(stopped), cmocka_unit_test(ten_clips),         cmocka_unit_test(solvers_and_noise),
         cmocka_unit_test(layers),  cmocka_unit_test(against_the_truth), cmocka_unit_test(trained),
         cmocka_unit_test(preview), cmocka_unit_test(precisions),        cmocka_unit_test(windows),
-        cmocka_unit_test(dry_run), cmocka_unit_test(refusals),
+        cmocka_unit_test(dry_run), cmocka_unit_test(budgets),           cmocka_unit_test(refusals),
     };
     if (argc < 1 || !run_find(program, argv[0], "dar-sample") || !run_find(bundler, argv[0], "dar-bundle")) return 2;
     return cmocka_run_group_tests_name("dar-sample", tests, in_directory, scratch_leave) != 0;
