@@ -51,7 +51,7 @@ FUZZ  := $(patsubst tests/%.c,%,$(wildcard tests/fuzz_*.c))
 HDR   := $(wildcard $(addsuffix /*.h,$(ROOMS) tests))
 
 .PHONY: all install everything headers test test-built check lint stress bench-kernels bench-dit bench-vae bench-weights
-.PHONY: bench-train demo pretrain sweep ulp fuzz fuzz-run
+.PHONY: bench bench-data bench-train demo pretrain sweep ulp fuzz fuzz-run
 .PHONY: deps clean help FORCE
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -131,7 +131,17 @@ $B/speed_%: $B/tests/speed_%.o $B/tests/rate.o $B/tests/bench_peak.o $B/libdar.a
 	@echo "LD $@"
 	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
 
-bench: deps ## speed of whole tasks, stage by stage: build/bench/data.csv
+$B/speed_sample: $(patsubst %.c,$B/%.o,$(wildcard tests/work_*.c)) $B/infer/dar_eval_html.o
+
+# The front is the model's own where nothing else is asked for.
+MODEL := models/dar-tiny
+bench: deps ## run time against error: build/bench/work_precision.html, pareto.json; MODEL=DIR, QUICK=1
+	@$(MAKE) --no-print-directory $B/speed_sample
+	@mkdir -p build/bench
+	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_sample --model $(MODEL) $(if $(QUICK),--quick --scenes 3 \
+		--rounds 1 --fine 60 -o build/bench/quick,--front $(MODEL)/front.json) $(ARGS)
+
+bench-data: deps ## scenes to G-buffers and bundles, stage by stage, against bars: build/bench/data.csv
 	@$(MAKE) --no-print-directory $B/speed_data
 	@mkdir -p build/bench
 	@OMP_PROC_BIND=true OMP_PLACES=threads $B/speed_data --output=build/bench/data.csv

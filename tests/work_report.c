@@ -1,0 +1,422 @@
+/* work_report.c: what the rows say: the front, drawings, a page. */
+#include <errno.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "infer/dar_eval_html.h"
+#include "lib/file.h"
+#include "lib/plot.h"
+#include "tests/work.h"
+
+#define MOST 128 /* settings; scenes */
+
+/* A setting over the scenes of a kind. */
+struct mean {
+    const work_row *row; /* of one of them */
+    size_t scenes;
+    double time, psnr_truth;     /* share of the full run's time, geometric mean; mean change [dB] */
+    double error, ode, estimate; /* the largest */
+    double psnr, ssim, flip;     /* the worst */
+    double class[WORK_CLASSES];  /* the largest */
+};
+
+static bool of_kind(const work_row *r, int kind)
+{
+    return kind == DAR_FRONT_ANY || (r->v[WORK_CAMERA_STILL] > 0) == (kind == DAR_FRONT_STILL);
+}
+
+static double larger(double a, double b)
+{
+    return !(a >= b) ? b : a;
+}
+
+static double smaller(double a, double b)
+{
+    return !(a <= b) ? b : a;
+}
+
+/* Settings in the order in which they were first measured; returns how many. */
+static size_t collect(const work_table *t, int kind, struct mean *m)
+{
+    size_t n = 0, i;
+    for (size_t k = 0; k < t->n; k++) {
+        const work_row *r = &t->row[k], *full = work_find(t, r->text[WORK_SCENE], WORK_FULL);
+        if (!full || !of_kind(r, kind)) continue;
+        for (i = 0; i < n && strcmp(m[i].row->text[WORK_SETTING], r->text[WORK_SETTING]) != 0; i++) continue;
+        if (i == MOST) continue;
+        if (i == n) {
+            m[n++] = (struct mean){ .row = r, .ssim = NAN, .psnr = NAN };
+            for (int c = 0; c < WORK_CLASSES; c++) m[i].class[c] = NAN;
+        }
+        m[i].scenes++;
+        m[i].time += log(r->v[WORK_SECONDS] / full->v[WORK_SECONDS]);
+        m[i].psnr_truth += r->v[WORK_PSNR_TRUTH] - full->v[WORK_PSNR_TRUTH];
+        m[i].error = larger(m[i].error, r->v[WORK_ERROR]);
+        m[i].ode = larger(m[i].ode, r->v[WORK_ODE]);
+        m[i].estimate = larger(m[i].estimate, r->v[WORK_ESTIMATE]);
+        m[i].flip = larger(m[i].flip, r->v[WORK_FLIP]);
+        m[i].psnr = smaller(m[i].psnr, r->v[WORK_PSNR]);
+        m[i].ssim = smaller(m[i].ssim, r->v[WORK_SSIM]);
+        for (int c = 0; c < WORK_CLASSES; c++) m[i].class[c] = larger(m[i].class[c], r -> v[WORK_EMPTY + c]);
+    }
+    for (i = 0; i < n; i++) {
+        m[i].time = exp(m[i].time / (double)m[i].scenes);
+        m[i].psnr_truth /= (double)m[i].scenes;
+    }
+    return n;
+}
+
+static const struct mean *find(const struct mean *m, size_t n, const char *setting)
+{
+    for (size_t i = 0; i < n; i++)
+        if (strcmp(m[i].row->text[WORK_SETTING], setting) == 0) return &m[i];
+    return NULL;
+}
+
+/* ---------------------------------------------------------------- the front */
+
+static int by_time(const void *a, const void *b)
+{
+    double x = ((const struct mean *)a)->time, y = ((const struct mean *)b)->time;
+    return (x > y) - (x < y);
+}
+
+/* What the sampler may choose: on all threads with all skips, and measured on every scene of the kind.  Its error can
+ * be estimated while it runs, or it makes the full run's steps. */
+static bool eligible(const struct mean *m, size_t scenes)
+{
+    const work_row *r = m->row;
+    const bool euler = strcmp(r->text[WORK_SOLVER], dar_solver_name[DAR_EULER]) == 0;
+    return r->v[WORK_THREADS] <= 0 && strcmp(r->text[WORK_SKIPS], "all") == 0 && m->scenes == scenes &&
+           (r->v[WORK_TOLERANCE] > 0 || (euler && r->v[WORK_STEPS] >= 50)) && isfinite(m->error);
+}
+
+static int index_of(const char *name, const char *const *names)
+{
+    int i = 0;
+    while (names[i] && strcmp(names[i], name) != 0) i++;
+    return i;
+}
+
+static dar_front_setting setting_of(const struct mean *m)
+{
+    const work_row *r = m->row;
+    return (dar_front_setting){ .name = r->text[WORK_SETTING],
+                                .precision = index_of(r->text[WORK_PRECISION], dar_pipeline_precision),
+                                .solver = (dar_solver_kind)index_of(r->text[WORK_SOLVER], dar_solver_name),
+                                .steps = (size_t)r->v[WORK_STEPS],
+                                .tolerance = r->v[WORK_TOLERANCE],
+                                .guidance_tolerance = r->v[WORK_GUIDANCE_TOLERANCE],
+                                .time = m->time,
+                                .error = m->error,
+                                .estimate = m->estimate,
+                                .psnr = m->psnr };
+}
+
+/* Of each precision by itself, as a call of the program opens its model once for several scenes. */
+static void fill_row(const work_table *t, int kind, dar_front_row *row)
+{
+    struct mean m[MOST];
+    size_t n = collect(t, kind, m), scenes = 0;
+    double least[DAR_PIPELINE_INT8 + 1];
+    for (size_t i = 0; i < DAR_COUNT(least); i++) least[i] = INFINITY;
+    row->visible[0] = INFINITY, row->visible[1] = 0;
+    for (size_t k = 0; k < t->n; k++) {
+        const work_row *r = &t->row[k];
+        if (strcmp(r->text[WORK_SETTING], WORK_FULL) != 0 || !of_kind(r, kind)) continue;
+        scenes++;
+        row->visible[0] = fmin(row->visible[0], r->v[WORK_VISIBLE]);
+        row->visible[1] = fmax(row->visible[1], r->v[WORK_VISIBLE]);
+    }
+    row->scenes = scenes;
+    qsort(m, n, sizeof *m, by_time);
+    for (size_t i = 0; i < n && row->settings < DAR_FRONT_MOST; i++) {
+        dar_front_setting s = setting_of(&m[i]);
+        if (!eligible(&m[i], scenes) || !(s.error < least[s.precision])) continue;
+        least[s.precision] = s.error;
+        row->setting[row->settings++] = s;
+    }
+}
+
+void work_front(const work_table *t, const char *model, double safety, dar_front *f)
+{
+    *f = (dar_front){ .model = model, .safety = safety };
+    for (int k = 0; k < DAR_FRONT_KINDS; k++) fill_row(t, k, &f->kind[k]);
+}
+
+/* ---------------------------------------------------------------- drawings */
+
+/* Points of one precision and solver: with fewer steps, or with a tolerance on all of them. */
+struct line {
+    char label[3 * WORK_TEXT];
+    size_t n;
+    double x[MOST], y[MOST];
+    const char *name[MOST];
+};
+
+struct drawing {
+    struct line line[MOST];
+    size_t lines;
+    double floor[3][2], ends[2]; /* vertical lines */
+};
+
+typedef double coordinate(const struct mean *m);
+
+static double error_of(const struct mean *m)
+{
+    return m->error;
+}
+
+static double psnr_of(const struct mean *m)
+{
+    return m->psnr;
+}
+
+static double change_of(const struct mean *m)
+{
+    return m->psnr_truth;
+}
+
+static void collect_lines(struct drawing *d, const struct mean *m, size_t n, coordinate *x)
+{
+    d->lines = 0;
+    for (size_t i = 0; i < n; i++) {
+        const work_row *r = m[i].row;
+        char label[3 * WORK_TEXT];
+        size_t k = 0;
+        bool tolerance = r->v[WORK_TOLERANCE] > DAR_FRONT_WATCH, guided = r->v[WORK_GUIDANCE_TOLERANCE] > 0;
+        if (strcmp(r->text[WORK_SKIPS], "all") != 0 || r->v[WORK_THREADS] > 0 || !(m[i].error > 0)) continue;
+        snprintf(label, sizeof label, "%s %s, %s%s", r->text[WORK_PRECISION], r->text[WORK_SOLVER],
+                 tolerance ? "tolerance" : "steps", guided ? ", guidance" : "");
+        while (k < d->lines && strcmp(d->line[k].label, label) != 0) k++;
+        struct line *l = &d->line[k];
+        if (k == d->lines) {
+            d->lines++;
+            l->n = 0;
+            memcpy(l->label, label, sizeof label);
+        }
+        l->x[l->n] = x(&m[i]);
+        l->y[l->n] = m[i].time;
+        l->name[l->n++] = r->text[WORK_SETTING];
+    }
+}
+
+/* With noise floors if x is the error. */
+static dar_status draw(struct drawing *d, const struct mean *m, size_t n, coordinate *x, const dar_plot_axis *axis,
+                       char **svg, dar_err *e)
+{
+    static const char *const floors[] = { "f64 euler-50", "bf16 euler-50", WORK_FULL };
+    static const char *const labels[] = { "f64 against f32", "bf16 against f32", "full against the ODE" };
+    dar_plot_series s[MOST + 3];
+    size_t k = 0;
+    collect_lines(d, m, n, x);
+    d->ends[0] = 0.05, d->ends[1] = 1;
+    for (int i = 0; i < 3 && x == error_of; i++) {
+        const struct mean *at = find(m, n, floors[i]);
+        double where = !at ? NAN : i == 2 ? at->ode : at->error;
+        d->floor[i][0] = d->floor[i][1] = where;
+        if (where > 0)
+            s[k++] = (dar_plot_series){
+                .label = labels[i], .colour = 8 + i, .faint = true, .n = 2, .x = d->floor[i], .y = d->ends
+            };
+    }
+    for (size_t i = 0; i < d->lines; i++) {
+        const struct line *l = &d->line[i];
+        s[k++] = (dar_plot_series){ .label = l->label,
+                                    .mark = DAR_PLOT_POINTS,
+                                    .colour = (int)i,
+                                    .n = l->n,
+                                    .x = l->x,
+                                    .y = l->y,
+                                    .tips = l->name };
+    }
+    const dar_plot p = { .x = *axis,
+                         .y = { "time, share of the full run's", true, 0, 0 },
+                         .series = s,
+                         .n = k,
+                         .width = 900,
+                         .height = 560 };
+    return dar_plot_text(&p, svg, e);
+}
+
+/* ---------------------------------------------------------------- the page */
+
+static void cell(FILE *f, const char *format, double x)
+{
+    if (isfinite(x)) {
+        fputs("<td>", f);
+        fprintf(f, format, x);
+    } else {
+        fputs("<td>&ndash;", f);
+    }
+}
+
+static void table_front(FILE *f, const dar_front *front)
+{
+    fputs("<h2 id=front>What to use</h2><p class=note>The cheapest settings for an error, by kind of scene: what "
+          "<code>dar-sample --error-budget</code> chooses from. The bound is the largest error of any scene times the "
+          "safety factor.</p><div class=scroll><table><tr><th>scenes<th>setting<th>time<th>faster<th>largest error"
+          "<th>bound<th>least PSNR [dB]</tr>\n",
+          f);
+    for (int k = 0; k < DAR_FRONT_KINDS; k++)
+        for (size_t i = 0; i < front->kind[k].settings; i++) {
+            const dar_front_setting *s = &front->kind[k].setting[i];
+            fprintf(f, "<tr><td>%s (%zu)<td>%s", dar_front_kind[k], front->kind[k].scenes, s->name);
+            cell(f, "%.3f", s->time);
+            cell(f, "%.2f&times;", 1 / s->time);
+            cell(f, "%.2e", s->error);
+            cell(f, "%.2e", s->error * front->safety);
+            cell(f, "%.1f", s->psnr);
+            fputs("</tr>\n", f);
+        }
+    fputs("</table></div>\n", f);
+}
+
+static void table_all(FILE *f, const struct mean *m, size_t n)
+{
+    fputs("<h2 id=all>Every setting</h2><p class=note>Over all scenes: time as geometric mean, everything else the "
+          "worst, but the change of PSNR against the bundle's own frames, a mean. Errors of the latent, relative L2 "
+          "against the full run, also by what its places show.</p><div class=scroll><table><tr><th>setting<th>scenes"
+          "<th>time<th>error<th>against the ODE<th>empty<th>still<th>moving<th>edge<th>PSNR<th>SSIM<th>FLIP"
+          "<th>PSNR of truth</tr>\n",
+          f);
+    for (size_t i = 0; i < n; i++) {
+        fprintf(f, "<tr><td>%s<td>%zu", m[i].row->text[WORK_SETTING], m[i].scenes);
+        cell(f, "%.3f", m[i].time);
+        cell(f, "%.2e", m[i].error);
+        cell(f, "%.2e", m[i].ode);
+        for (int c = 0; c < WORK_CLASSES; c++) cell(f, "%.2e", m[i].class[c]);
+        cell(f, "%.1f", m[i].psnr);
+        cell(f, "%.4f", m[i].ssim);
+        cell(f, "%.4f", m[i].flip);
+        cell(f, "%+.3f", m[i].psnr_truth);
+        fputs("</tr>\n", f);
+    }
+    fputs("</table></div>\n", f);
+}
+
+static void table_scenes(FILE *f, const work_table *t)
+{
+    fputs("<h2 id=scenes>Scenes</h2><div class=scroll><table><tr><th>scene<th>camera<th>visible<th>full run [s]"
+          "<th>TFLOP<th>calls<th>memory [MB]<th>PSNR of truth [dB]</tr>\n",
+          f);
+    for (size_t i = 0; i < t->n; i++) {
+        const work_row *r = &t->row[i];
+        if (strcmp(r->text[WORK_SETTING], WORK_FULL) != 0) continue;
+        fprintf(f, "<tr><td>%s<td>%s", r->text[WORK_SCENE], r->v[WORK_CAMERA_STILL] > 0 ? "still" : "moving");
+        cell(f, "%.0f %%", 100 * r->v[WORK_VISIBLE]);
+        cell(f, "%.2f", r->v[WORK_SECONDS]);
+        cell(f, "%.3f", 1e-12 * r->v[WORK_FLOPS]);
+        cell(f, "%.0f", r->v[WORK_CALLS]);
+        cell(f, "%.0f", 1e-6 * r->v[WORK_PEAK]);
+        cell(f, "%.2f", r->v[WORK_PSNR_TRUTH]);
+        fputs("</tr>\n", f);
+    }
+    fputs("</table></div>\n", f);
+}
+
+static dar_status figure(FILE *f, struct drawing *d, const struct mean *m, size_t n, coordinate *x,
+                         const dar_plot_axis *axis, const char *caption, dar_err *e)
+{
+    char *svg;
+    DAR_TRY(draw(d, m, n, x, axis, &svg, e));
+    fprintf(f, "<figure>%s<figcaption>%s</figcaption></figure>\n", svg, caption);
+    free(svg);
+    return DAR_OK;
+}
+
+static const dar_plot_axis by_error = { "largest error of a scene: relative L2 of the latent", true, 0, 0 };
+static const dar_plot_axis by_psnr = { "least PSNR of a scene against the full run [dB]", false, 0, 0 };
+static const dar_plot_axis by_change = { "mean change of PSNR against the bundle's own frames [dB]", false, 0, 0 };
+
+static dar_status print_page(FILE *f, const work_table *t, const dar_front *front, struct drawing *d, dar_err *e)
+{
+    struct mean m[MOST];
+    const size_t n = collect(t, DAR_FRONT_ANY, m);
+    dar_html_begin(f, "Run time against error");
+    fputs("<header><h1>Run time against error</h1><p>", f);
+    dar_html_text(f, t->n ? t->row[0].text[WORK_MODEL] : "");
+    fprintf(f,
+            ": %zu rows on %zu scenes. The full run is f32, 50 steps of Euler, no skip. Below and to the left is "
+            "better.</p></header>\n<main><div class=plots>\n",
+            t->n, front->kind[DAR_FRONT_ANY].scenes);
+    DAR_TRY(figure(f, d, m, n, error_of, &by_error,
+                   "Vertical: how far precisions are from each other, and the full run from what it approximates.", e));
+    DAR_TRY(figure(f, d, m, n, psnr_of, &by_psnr, "Frames; to the right is better.", e));
+    DAR_TRY(figure(f, d, m, n, change_of, &by_change, "What it costs against the truth; 0 is nothing.", e));
+    fputs("</div>\n", f);
+    table_front(f, front);
+    table_scenes(f, t);
+    table_all(f, m, n);
+    fputs("</main></body></html>\n", f);
+    return DAR_OK;
+}
+
+/* ---------------------------------------------------------------- files */
+
+static dar_status write_text(const char *directory, const char *name, const char *text, dar_err *e)
+{
+    char path[PATH_MAX];
+    dar_file_out o = { .fd = -1 };
+    snprintf(path, sizeof path, "%.*s%s%s", PATH_MAX - 64, directory ? directory : "", directory ? "/" : "", name);
+    dar_status s = dar_file_create(&o, path, e);
+    if (s == DAR_OK) s = dar_file_write(&o, text, strlen(text), e);
+    if (s == DAR_OK) s = dar_file_write(&o, "\n", 1, e);
+    if (s == DAR_OK) s = dar_file_commit(&o, e);
+    dar_file_discard(&o);
+    return s;
+}
+
+static dar_status write_page(const work_table *t, const char *directory, const dar_front *front, struct drawing *d,
+                             dar_err *e)
+{
+    char *text = NULL;
+    size_t size = 0;
+    FILE *f = open_memstream(&text, &size);
+    if (!f) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory for the page", directory);
+    dar_status s = print_page(f, t, front, d, e);
+    if (fclose(f) != 0 && s == DAR_OK) s = dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory for the page", directory);
+    if (s == DAR_OK) s = write_text(directory, "work_precision.html", text, e);
+    free(text);
+    return s;
+}
+
+static dar_status write_svg(const work_table *t, const char *directory, struct drawing *d, dar_err *e)
+{
+    struct mean m[MOST];
+    char *svg;
+    DAR_TRY(draw(d, m, collect(t, DAR_FRONT_ANY, m), error_of, &by_error, &svg, e));
+    dar_status s = write_text(directory, "work_precision.svg", svg, e);
+    free(svg);
+    return s;
+}
+
+static dar_status write_json(const work_table *t, const char *directory, const dar_front *f, const char *front,
+                             dar_err *e)
+{
+    dar_json_writer rows = { .pretty = true }, w = { .pretty = true };
+    work_print(t, &rows);
+    dar_front_print(f, &w);
+    dar_status s = rows.failed || w.failed ? dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", directory) : DAR_OK;
+    if (s == DAR_OK) s = write_text(directory, "work_precision.json", rows.text, e);
+    if (s == DAR_OK) s = write_text(directory, "pareto.json", w.text, e);
+    if (s == DAR_OK && front) s = write_text(NULL, front, w.text, e);
+    dar_json_writer_free(&rows);
+    dar_json_writer_free(&w);
+    return s;
+}
+
+dar_status work_report(const work_table *t, const char *directory, const char *model, double safety, const char *front,
+                       dar_err *e)
+{
+    dar_front f;
+    struct drawing *d = calloc(1, sizeof *d);
+    if (!d) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", directory);
+    work_front(t, model, safety, &f);
+    dar_status s = write_json(t, directory, &f, front, e);
+    if (s == DAR_OK) s = write_svg(t, directory, d, e);
+    if (s == DAR_OK) s = write_page(t, directory, &f, d, e);
+    free(d);
+    return s;
+}
