@@ -529,7 +529,7 @@ static dar_status synth(dar_run *r, dar_err *e)
         dar_run_say(r, "%s: %zu bundles of the set %s", o.out, j.count, j.set->name);
         return DAR_OK;
     }
-    if (mkdir(o.out, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", o.out, strerror(errno));
+    DAR_TRY(dar_dir_make(o.out, e));
     DAR_TRY(dar_dir_lock(&lock, o.out, e));
     dar_status s = fill(&j, r, e);
     close(lock);

@@ -1,5 +1,4 @@
 /* dar_sample.c: the program dar-sample: bundles, a picture and a model in, videos out. */
-#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -11,6 +10,7 @@
 #include "infer/output.h"
 #include "infer/pipeline.h"
 #include "infer/preview.h"
+#include "lib/dir.h"
 #include "lib/log.h"
 #include "lib/program.h"
 #include "lib/sha256.h"
@@ -713,8 +713,7 @@ static dar_status sample_all(struct job *j, dar_err *e)
 {
     const dar_program *p = j->r->program;
     dar_status s = DAR_OK;
-    if ((p->rests > 1 || o.references.n > 1) && !o.common.dry_run && mkdir(o.out, 0777) != 0 && errno != EEXIST)
-        return dar_fail(e, DAR_ERR_IO, "%s: %s", o.out, strerror(errno));
+    if ((p->rests > 1 || o.references.n > 1) && !o.common.dry_run) DAR_TRY(dar_dir_make(o.out, e));
     dar_json_write_array(&j->r->json, "bundles");
     for (int i = 0; i < p->rests && s == DAR_OK; i++) {
         dar_json_write_object(&j->r->json, NULL);

@@ -119,7 +119,14 @@ static int make_temp(dar_dir_out *o)
 
 /* ---------------------------------------------------------------- writing */
 
-dar_status dar_dir_make(const char *path, dar_err *e)
+static dar_status make_one(const char *path, dar_err *e)
+{
+    if (mkdir(path, 0777) == 0 || errno == EEXIST) return DAR_OK;
+    return dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
+}
+
+/* The directories that `path` lies in. */
+static dar_status make_parents(const char *path, dar_err *e)
 {
     char part[PATH_MAX];
     if (snprintf(part, sizeof part, "%s", path) >= (int)sizeof part)
@@ -127,11 +134,16 @@ dar_status dar_dir_make(const char *path, dar_err *e)
     for (char *p = part + 1; *p; p++) {
         if (*p != '/') continue;
         *p = 0;
-        if (mkdir(part, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", part, strerror(errno));
+        DAR_TRY(make_one(part, e));
         *p = '/';
     }
-    if (mkdir(part, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", part, strerror(errno));
     return DAR_OK;
+}
+
+dar_status dar_dir_make(const char *path, dar_err *e)
+{
+    DAR_TRY(make_parents(path, e));
+    return make_one(path, e);
 }
 
 dar_status dar_dir_create(dar_dir_out *o, const char *path, dar_err *e)
@@ -142,6 +154,7 @@ dar_status dar_dir_create(dar_dir_out *o, const char *path, dar_err *e)
     while (length > 1 && path[length - 1] == '/') length--;
     if (length >= sizeof o->path) return refused(path, ENAMETOOLONG, e);
     snprintf(o->path, sizeof o->path, "%.*s", (int)length, path);
+    DAR_TRY(make_parents(o->path, e));
     sweep(o->path);
     int error = make_temp(o);
     if (!error) return DAR_OK;

@@ -23,8 +23,8 @@ typedef struct dar_dir_out {
 /* Make a directory, and those it lies in, where they are not there. */
 dar_status dar_dir_make(const char *path, dar_err *e);
 
-/* Make the temporary directory beside `path`.  From here to commit nothing touches `path`.  After a failure of any of
- * these the caller owes one dar_dir_discard. */
+/* Make the temporary directory beside `path`, and those it lies in where they are not there.  From here to commit
+ * nothing touches `path`.  After a failure of any of these the caller owes one dar_dir_discard. */
 dar_status dar_dir_create(dar_dir_out *o, const char *path, dar_err *e);
 
 /* Flush and rename to `path`.  Fails if something is there, unless it may be overwritten: then the two change places in

@@ -363,7 +363,7 @@ static void refusals(void **state)
         { { "render", "scene.glb", "-o", "no", "--shade", "day", "--sun", "north" }, "--sun: found 'north'" },
         { { "render", "scene.glb", "-o", "no", "--shade", "day", "--rgb", "." }, "expected one of --shade, --rgb" },
         { { "render", "scene.glb", "-o", "no", "--track-side", "2" }, "found 2, expected an odd number" },
-        { { "render", "scene.glb", "-o", "nowhere/no" }, "nowhere/no" },
+        { { "render", "scene.glb", "-o", "scene.glb/no" }, "scene.glb/no: Not a directory" },
         { { "render", "scene.glb", "-o", "scene.glb" }, "scene.glb: is there already" },
         { { "show", "scene.glb", "-o", "no" }, "scene.glb" },
         { { "show", ".", "-o", "no" }, "meta.json" },
@@ -488,6 +488,16 @@ static void another_set(void **state)
     GOOD(FEW, "--count=2", "-o", "cars", "--family", "vehicle");
 }
 
+/* Directories that an output is to lie in are made. */
+static void new_directories(void **state)
+{
+    (void)state;
+    GOOD("render", SCENE, "-o", "new/one/bundle");
+    GOOD(FEW, "-o", "new/two/set");
+    CHECK(run_is_there("new/one/bundle/meta.json") && run_is_there("new/two/set/manifest.json"), "nothing is there");
+    BAD(2, "scene.glb/set: Not a directory", FEW, "-o", "scene.glb/set");
+}
+
 /* While one process, stopped here, is at work in a directory, another leaves it alone. */
 static void two_at_once(void **state)
 {
@@ -548,6 +558,7 @@ int main(int argc, char **argv)
         cmocka_unit_test(interrupted),
         cmocka_unit_test(synthetic),
         cmocka_unit_test(another_set),
+        cmocka_unit_test(new_directories),
         cmocka_unit_test(two_at_once),
         cmocka_unit_test(full_disk),
     };

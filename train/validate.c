@@ -1,16 +1,15 @@
 /* validate.c: see validate.h. */
 #include "train/validate.h"
 
-#include <errno.h>
 #include <limits.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/stat.h>
 
 #include "data/metric.h"
 #include "data/sheet.h"
+#include "lib/dir.h"
 #include "lib/log.h"
 #include "lib/program.h"
 #include "models/encode.h"
@@ -131,13 +130,9 @@ static const char *name_of(const char *path)
 
 static dar_status make_place(const dar_validator *v, int64_t step, char path[PATH_MAX], dar_err *e)
 {
-    int n = snprintf(path, PATH_MAX, "%s/samples", v->c->output);
-    if (n < PATH_MAX && mkdir(path, 0777) != 0 && errno != EEXIST)
-        return dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
-    n = snprintf(path, PATH_MAX, "%s/samples/step-%08lld", v->c->output, (long long)step);
+    int n = snprintf(path, PATH_MAX, "%s/samples/step-%08lld", v->c->output, (long long)step);
     if (n >= PATH_MAX) return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", v->c->output);
-    if (mkdir(path, 0777) != 0 && errno != EEXIST) return dar_fail(e, DAR_ERR_IO, "%s: %s", path, strerror(errno));
-    return DAR_OK;
+    return dar_dir_make(path, e);
 }
 
 static dar_status write_sheet(struct showing *s, const char *place, const char *name, dar_err *e)
