@@ -390,12 +390,15 @@ static void refusals(void **state)
 
 /* ---------------------------------------------------------------- stopped half way */
 
-/* Start a render that would take a minute, and wait until it writes frames. */
+/* Start a render that would take a minute, and wait until it writes frames: a minute at most, since others may have the
+ * processors.  Quiet, for after ten seconds it would tell how far it is. */
 static pid_t start_long(void)
 {
-    pid_t pid = run_start(program, (const char *const[]){ "render", "scene.glb", "--size", "320x200", "--frames",
-                                                          "20001", "-o", "long", "--trajectory", "full-orbit", NULL });
-    for (int i = 0; i < 2000 && count(".", "long") == 0; i++) nanosleep(&(struct timespec){ .tv_nsec = 5000000 }, NULL);
+    pid_t pid =
+        run_start(program, (const char *const[]){ "render", "scene.glb", "--size", "320x200", "--frames", "20001", "-o",
+                                                  "long", "--trajectory", "full-orbit", "--quiet", NULL });
+    for (int i = 0; i < 12000 && count(".", "long") == 0; i++)
+        nanosleep(&(struct timespec){ .tv_nsec = 5000000 }, NULL);
     nanosleep(&(struct timespec){ .tv_nsec = 100000000 }, NULL);
     CHECK(waitpid(pid, NULL, WNOHANG) == 0 && count(".", "long.tmp") == 1 && !run_is_there("long"), "it does not run");
     return pid;
@@ -431,7 +434,7 @@ static void interrupted(void **state)
 static void kill_at(const char *threads, const char *bundle)
 {
     pid_t pid = run_start(program, (const char *const[]){ SYNTH, "-o", "torn", "--threads", threads, NULL });
-    for (int i = 0; i < 4000 && !run_is_there(bundle); i++) nanosleep(&(struct timespec){ .tv_nsec = 2500000 }, NULL);
+    for (int i = 0; i < 24000 && !run_is_there(bundle); i++) nanosleep(&(struct timespec){ .tv_nsec = 2500000 }, NULL);
     kill(pid, SIGKILL);
     run_finish(pid);
     CHECK(run_is_there(bundle), "%s is not there: %s", bundle, ran.err);
@@ -503,7 +506,7 @@ static void two_at_once(void **state)
 {
     (void)state;
     pid_t pid = run_start(program, (const char *const[]){ SYNTH, "-o", "shared", "--threads", "2", NULL });
-    for (int i = 0; i < 4000 && !run_is_there("shared/000000"); i++)
+    for (int i = 0; i < 24000 && !run_is_there("shared/000000"); i++)
         nanosleep(&(struct timespec){ .tv_nsec = 2500000 }, NULL);
     kill(pid, SIGSTOP);
     int status = RUN(SYNTH, "-o", "shared");
