@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "lib/nearest.h"
+#include "lib/real.h"
 #include "lib/rng.h"
 
 #define ROWS    64 /* directions over which a sky is integrated */
@@ -116,7 +117,7 @@ static float dot(const float a[3], const float b[3])
 
 static float ramp(float lo, float hi, float x)
 {
-    float t = fminf(fmaxf((x - lo) / (hi - lo), 0), 1);
+    float t = dar_lesserf(dar_greaterf((x - lo) / (hi - lo), 0), 1);
     return t * t * (3 - 2 * t);
 }
 
@@ -128,13 +129,13 @@ static void mix(float y[3], const double to[3], float share)
 void dar_skylight_smooth(const dar_skylight *s, const float d[3], float y[3])
 {
     const dar_sky *sky = &s->sky;
-    float h = dot(d, s->up), toward = 0, width = (1 - cosf((float)sky->glow_size)) / 0.41421356f;
+    float h = dot(d, s->up), toward = 0;
 
     for (int c = 0; c < 3; c++) {
         y[c] = (float)sky->horizon[c];
         toward += d[c] * (float)sky->glow_toward[c];
     }
-    float glow = width / (width + fmaxf(1 - toward, 0));
+    float glow = s->glow_width / (s->glow_width + dar_greaterf(1 - toward, 0));
     if (h > 0) mix(y, sky->zenith, 1 - (1 - h) * (1 - h));
     for (int c = 0; c < 3; c++) y[c] += (float)sky->glow[c] * glow * glow; /* half at glow_size */
     if (h < 0)
@@ -162,7 +163,7 @@ static float cloud(const dar_skylight *s, float x, float y)
 
 static void add_clouds(const dar_skylight *s, const float d[3], float y[3])
 {
-    float h = dot(d, s->up), far = 1 / (fmaxf(h, 0) + 0.12f);
+    float h = dot(d, s->up), far = 1 / (dar_greaterf(h, 0) + 0.12f);
     if (h <= 0) return;
     float much = cloud(s, 1.3f * far * dot(d, s->east), 1.3f * far * dot(d, s->north));
     mix(y, s->sky.detail, 0.85f * ramp(0.46f, 0.72f, much) * ramp(0, 0.25f, h));
@@ -218,7 +219,7 @@ void dar_skylight_on(const dar_skylight *s, const float n[3], float y[3])
     for (int c = 0; c < 3; c++) {
         y[c] = 0;
         for (int k = 0; k < 9; k++) y[c] += b[k] * s->harmonic[k][c];
-        y[c] = fmaxf(y[c], 0);
+        y[c] = dar_greaterf(y[c], 0);
     }
 }
 
@@ -263,6 +264,7 @@ void dar_skylight_init(dar_skylight *s, const dar_lighting *l)
 {
     uint64_t stream = dar_rng_stream("sky");
     s->sky = l->sky;
+    s->glow_width = (1 - cosf((float)s->sky.glow_size)) / 0.41421356f;
     set_axes(s, l->up);
     for (uint64_t i = 0; i < DAR_LIGHT_LATTICE * DAR_LIGHT_LATTICE; i++)
         s->noise[i / DAR_LIGHT_LATTICE][i % DAR_LIGHT_LATTICE] = dar_rng_f32(l->sky.seed, stream, i);

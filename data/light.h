@@ -92,6 +92,7 @@ void dar_lighting_aim(dar_lighting *l, double azimuth, double height);
 typedef struct dar_skylight {
     dar_sky sky;
     float up[3], east[3], north[3]; /* axes of azimuth */
+    float glow_width;               /* 1 - cos of the angle at which the glow is half, over sqrt(2) - 1 */
     float harmonic[9][3];
     float noise[DAR_LIGHT_LATTICE][DAR_LIGHT_LATTICE];
 } dar_skylight;

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "data/texture.h"
+#include "lib/real.h"
 #include "lib/size.h"
 #include "lib/thread.h"
 
@@ -100,7 +101,7 @@ static void bilinear(const dar_image *im, const dar_srgb *srgb, const dar_materi
 void dar_mip_at(const dar_mip *m, const dar_srgb *srgb, const dar_material *material, const float uv[2], float scale,
                 float y[3])
 {
-    float last = (float)(m->levels - 1), at = fminf(fmaxf(scale, 0), last), low = floorf(at);
+    float last = (float)(m->levels - 1), at = dar_lesserf(dar_greaterf(scale, 0), last), low = floorf(at);
     const dar_image *level = &m->level[(size_t)low];
     bool sane = fabsf(uv[0]) <= FARTHEST && fabsf(uv[1]) <= FARTHEST;
     const float zero[2] = { 0, 0 }, *where = sane ? uv : zero;

@@ -7,9 +7,12 @@
 #include "data/quality_inside.h"
 #include "data/rays.h"
 #include "data/rigid.h"
+#include "lib/real.h"
+#include "lib/size.h"
 #include "lib/thread.h"
 
 #define BAND    8192 /* pixels */
+#define STRIP   256  /* pixels whose numbers are read at a time */
 #define SAMPLES 256  /* pixels whose positions are tried with other cameras */
 #define FAR     32   /* depth is rounded by 2^-24: from this many sizes away on, errors are told in shares of the way */
 #define FLAT    0.03 /* of the depth: neighbours that differ by more are not of one surface */
@@ -53,15 +56,14 @@ static void add(dar_quality_sums *s, const double x[3], size_t channels)
     for (size_t c = 0; c < channels; c++) s->sum[c] += x[c], s->square[c] += x[c] * x[c];
 }
 
-static void scan_pixel(const struct scan *s, size_t i, tally *t)
+static void scan_pixel(const struct scan *s, size_t i, const double number[3], tally *t)
 {
     double x[3] = { 0 };
     bool zero = true, finite = true;
     for (size_t c = 0; c < s->channels; c++) {
-        double n = number_at(&s->plane, c * s->r->pixels + i);
-        zero = zero && n == 0;
-        finite = finite && isfinite(n);
-        x[c] = s->plane.scale[c] * n + s->plane.offset[c];
+        zero = zero && number[c] == 0;
+        finite = finite && isfinite(number[c]);
+        x[c] = s->plane.scale[c] * number[c] + s->plane.offset[c];
     }
     bool covered = s->r->cover[i] != 0;
     t->odd += !finite;
@@ -70,8 +72,8 @@ static void scan_pixel(const struct scan *s, size_t i, tally *t)
     t->covered++;
     add(&t->sums, x, s->channels);
     for (size_t c = 0; c < s->channels; c++) {
-        t->lo[c] = fmin(t->lo[c], x[c]);
-        t->hi[c] = fmax(t->hi[c], x[c]);
+        t->lo[c] = dar_lesser(x[c], t->lo[c]);
+        t->hi[c] = dar_greater(x[c], t->hi[c]);
     }
     if (s->visit) s->visit(s, i, x, t);
 }
@@ -87,9 +89,14 @@ static void scan_band(void *ctx, size_t band, int thread)
 {
     const struct scan *s = ctx;
     size_t begin = band * BAND, end = begin + BAND < s->r->pixels ? begin + BAND : s->r->pixels;
+    double x[3][STRIP] = { { 0 } };
     tally t = nothing();
     (void)thread;
-    for (size_t i = begin; i < end; i++) scan_pixel(s, i, &t);
+    for (size_t at = begin; at < end; at += STRIP) {
+        size_t n = dar_least(end - at, STRIP);
+        for (size_t c = 0; c < s->channels; c++) dar_plane_numbers(&s->plane, c * s->r->pixels + at, n, x[c]);
+        for (size_t i = 0; i < n; i++) scan_pixel(s, at + i, (const double[]){ x[0][i], x[1][i], x[2][i] }, &t);
+    }
     s->r->tally[band] = t;
 }
 
@@ -126,6 +133,7 @@ static dar_status scan_family(struct scan *s, dar_family family, tally *t)
     const char *name = dar_family_table[family].name;
     DAR_TRY(dar_bundle_plane(r->b, family, r->frame, &s->plane, r->e));
     s->channels = dar_family_table[family].channels;
+    s->zero_is_value = family == DAR_FAMILY_WORLD && s->plane.type == DAR_PLANE_F32;
     dar_parallel(r->bands, scan_band, s);
     *t = merged(r);
     merge_sums(&r->sums[family], &t->sums);
@@ -147,7 +155,7 @@ static void point_of(const dar_view *v, size_t i, double depth, double x[3])
 
 static double largest_difference(const double a[3], const double b[3])
 {
-    return fmax(fabs(a[0] - b[0]), fmax(fabs(a[1] - b[1]), fabs(a[2] - b[2])));
+    return dar_greater(fabs(a[0] - b[0]), dar_greater(fabs(a[1] - b[1]), fabs(a[2] - b[2])));
 }
 
 /* Of a position against the depth of its pixel, in sizes of the scene. */
@@ -156,7 +164,7 @@ static double position_error(const dar_quality_run *r, const dar_view *v, size_t
     double p[3], away[3];
     point_of(v, i, (double)r->depth[i], p);
     for (int c = 0; c < 3; c++) away[c] = p[c] - v->c2w[4 * c + 3];
-    return largest_difference(p, x) / fmax(r->size, sqrt(dar_vec_dot(away, away)) / FAR);
+    return largest_difference(p, x) / dar_greater(r->size, sqrt(dar_vec_dot(away, away)) / FAR);
 }
 
 /* ---------------------------------------------------------------- families */
@@ -237,9 +245,6 @@ static dar_status check_world(dar_quality_run *r, const dar_view *v)
 {
     struct scan s = { .r = r, .view = v, .visit = visit_world };
     tally t;
-    dar_plane first;
-    DAR_TRY(dar_bundle_plane(r->b, DAR_FAMILY_WORLD, r->frame, &first, r->e));
-    s.zero_is_value = first.type == DAR_PLANE_F32;
     DAR_TRY(scan_family(&s, DAR_FAMILY_WORLD, &t));
     if (t.covered == 0) return DAR_OK;
     for (int c = 0; c < 3; c++) r->lo[c] = fmin(r->lo[c], t.lo[c]), r->hi[c] = fmax(r->hi[c], t.hi[c]);
@@ -259,7 +264,7 @@ static bool slope_at(const dar_quality_run *r, const dar_view *v, size_t i, doub
     double p[3], q[3], s[3];
     if (right % width == 0 || below >= r->pixels || !r->cover[right] || !r->cover[below]) return false;
     double z = (double)r->depth[i];
-    if (fmax(fabs((double)r->depth[right] - z), fabs((double)r->depth[below] - z)) > FLAT * z) return false;
+    if (dar_greater(fabs((double)r->depth[right] - z), fabs((double)r->depth[below] - z)) > FLAT * z) return false;
     point_of(v, i, z, p);
     point_of(v, right, (double)r->depth[right], q);
     point_of(v, below, (double)r->depth[below], s);

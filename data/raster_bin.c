@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "data/raster_inside.h"
+#include "lib/real.h"
 #include "lib/thread.h"
 
 #define SLACK 1e-6 /* [px] around the corners of a triangle, and relative: rounding of the projection stays inside */
@@ -117,10 +118,10 @@ void dar_raster_transform(dar_raster *r, const dar_pose *p, bool moved)
 /* Grow box (lowest x, y, highest x, y) by a point. */
 static void grow(double box[4], double x, double y)
 {
-    box[0] = fmin(box[0], x);
-    box[1] = fmin(box[1], y);
-    box[2] = fmax(box[2], x);
-    box[3] = fmax(box[3], y);
+    box[0] = dar_lesser(x, box[0]);
+    box[1] = dar_lesser(y, box[1]);
+    box[2] = dar_greater(x, box[2]);
+    box[3] = dar_greater(y, box[3]);
 }
 
 /* Of the part of a triangle that is not nearer than near. */

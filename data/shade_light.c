@@ -2,6 +2,7 @@
 #include <math.h>
 
 #include "data/shade_inside.h"
+#include "lib/real.h"
 
 #define GLOSSIEST 0.85f /* sharper highlights would flicker between samples */
 #define PLAIN     0.04f /* share of light that what is no metal mirrors straight back */
@@ -26,7 +27,7 @@ struct lobe {
 
 static struct lobe lobe_of(const dar_shade_place *p)
 {
-    struct lobe l = { .gloss = fminf(p->gloss, GLOSSIEST), .shiny = p->gloss > 0 || p->metallic > 0 };
+    struct lobe l = { .gloss = dar_lesserf(p->gloss, GLOSSIEST), .shiny = p->gloss > 0 || p->metallic > 0 };
     float rough = 1 - l.gloss;
     l.a2 = rough * rough * rough * rough;
     for (int c = 0; c < 3; c++) {
@@ -46,9 +47,10 @@ static void add_light(const dar_shade_place *p, const struct lobe *l, const floa
     for (int c = 0; c < 3; c++) y[c] += facing * color[c] * l->matte[c];
     if (!l->shiny) return;
     for (int c = 0; c < 3; c++) half[c] = d[c] + p->eye[c], length += half[c] * half[c];
-    float scale = 1 / sqrtf(fmaxf(length, 1e-8f)), nh = dot(p->normal, half) * scale, lh = dot(d, half) * scale;
+    float scale = 1 / sqrtf(dar_greaterf(length, 1e-8f)), nh = dot(p->normal, half) * scale, lh = dot(d, half) * scale;
     float spread = nh * nh * (l->a2 - 1) + 1;
-    float strength = facing * l->a2 / (spread * spread * 4 * fmaxf(lh * lh, 0.1f)), edge = fifth(1 - fminf(lh, 1));
+    float strength = facing * l->a2 / (spread * spread * 4 * dar_greaterf(lh * lh, 0.1f)),
+          edge = fifth(1 - dar_lesserf(lh, 1));
     for (int c = 0; c < 3; c++) y[c] += strength * color[c] * (l->mirror[c] + (1 - l->mirror[c]) * edge);
 }
 
@@ -71,7 +73,7 @@ static void add_bulbs(const dar_lighting *lighting, const dar_shade_place *p, co
         const dar_bulb *bulb = &lighting->bulb[i];
         float d[3], color[3];
         for (int c = 0; c < 3; c++) d[c] = (float)bulb->at[c] - p->x[c];
-        float square = dot(d, d), scale = 1 / sqrtf(fmaxf(square, 1e-12f)), reach = (float)bulb->reach;
+        float square = dot(d, d), scale = 1 / sqrtf(dar_greaterf(square, 1e-12f)), reach = (float)bulb->reach;
         for (int c = 0; c < 3; c++) {
             d[c] *= scale;
             color[c] = (float)bulb->color[c] / (0.1f + 0.9f * square / (reach * reach));
@@ -97,9 +99,9 @@ static void add_sky(const dar_shade *s, const dar_shade_place *p, const struct l
     for (int c = 0; c < 3; c++) mirrored[c] = 2 * across * p->normal[c] - p->eye[c];
     dar_skylight_on(s->sky, mirrored, wide);
     dar_skylight_smooth(s->sky, mirrored, sharp);
-    float edge = fifth(1 - fminf(fmaxf(across, 0), 1)), share = l->gloss * l->gloss;
+    float edge = fifth(1 - dar_lesserf(dar_greaterf(across, 0), 1)), share = l->gloss * l->gloss;
     for (int c = 0; c < 3; c++) {
-        float most = fmaxf(l->gloss, l->mirror[c]);
+        float most = dar_greaterf(l->gloss, l->mirror[c]);
         y[c] += open * (wide[c] + share * (sharp[c] - wide[c])) * (l->mirror[c] + (most - l->mirror[c]) * edge);
     }
 }

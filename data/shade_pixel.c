@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "data/shade_inside.h"
+#include "lib/real.h"
 #include "lib/thread.h"
 
 #define SURFACES 8 /* triangles kept at hand by a row */
@@ -51,7 +52,7 @@ static float texels_of(const dar_shade_surface *f, float area)
     float u1 = f->uv[1][0] - f->uv[0][0], v1 = f->uv[1][1] - f->uv[0][1];
     float u2 = f->uv[2][0] - f->uv[0][0], v2 = f->uv[2][1] - f->uv[0][1];
     float in_texture = fabsf(u1 * v2 - u2 * v1) * (float)im->width * (float)im->height;
-    return 0.5f * log2f(fmaxf(in_texture, 1e-12f) / fmaxf(area, 1e-30f));
+    return 0.5f * log2f(dar_greaterf(in_texture, 1e-12f) / dar_greaterf(area, 1e-30f));
 }
 
 /* Its own normal, towards the camera; returns twice its area. */
@@ -120,7 +121,7 @@ static void shade(const struct job *j, const dar_shade_surface *f, const float b
     }
     unit(p.eye);
     if (f->mip) {
-        float uv[2], texture[3], slant = fmaxf(dot(f->own, p.eye), 0.1f);
+        float uv[2], texture[3], slant = dar_greaterf(dot(f->own, p.eye), 0.1f);
         float side = depth * sqrtf(share / (slant * (float)(v->fx * v->fy)));
         blend(b, f->uv[0], f->uv[1], f->uv[2], 2, uv);
         dar_mip_at(f->mip, j->s->srgb, f->material, uv, f->texels + log2f(side), texture);

@@ -3,8 +3,12 @@
 
 #include <math.h>
 
+#include "lib/real.h"
+
 #define DISTANCE 1000.0 /* of the eye, in sizes of the box: its rays are parallel to 1e-3 */
 #define STEEP    6.0f   /* most slope of a plane that is followed */
+#define MOST     4      /* reach of an edge [texels] */
+#define TEXELS   (2 * MOST)
 
 /* Axes x, y across the direction, z away from the sun. */
 static void set_axes(dar_view *v, const double toward[3])
@@ -44,7 +48,7 @@ static void set_view(dar_shadow *s, const dar_shadow_config *c)
         s->slope[a] = (float)(distance / focal);
     }
     double texel = fmax(s->slope[0], s->slope[1]);
-    s->reach = (float)fmin(fmax(c->width / texel / 2, 1.5), 4);
+    s->reach = (float)fmin(fmax(c->width / texel / 2, 1.5), MOST);
     s->bias = (float)(0.7 * texel + 2e-7 * distance);
 }
 
@@ -66,14 +70,18 @@ void dar_shadow_draw(dar_shadow *s, const dar_pose *p)
     dar_raster_draw(&s->raster, p, &s->view, &s->map, s->raster.stats.frames ? &s->map : NULL);
 }
 
-/* Weights of a tent over the texels around x, and the first of them. */
-static int tent(float x, float reach, float weight[8], float *sum, int *first)
+/* Weights of a tent over the texels around x, zeros behind them; the first of them, and their number. */
+static int tent(float x, float reach, float weight[TEXELS], float *sum, int *first)
 {
     int n = 0;
     *first = (int)ceilf(x - 0.5f - reach);
     *sum = 0;
-    for (float at = (float)*first + 0.5f; n < 8 && at < x + reach; at += 1, n++)
-        *sum += weight[n] = 1 - fabsf(at - x) / reach;
+    for (int i = 0; i < TEXELS; i++) {
+        float at = (float)(*first + i) + 0.5f;
+        weight[i] = at < x + reach ? 1 - fabsf(at - x) / reach : 0;
+        n += at < x + reach;
+    }
+    for (int i = 0; i < TEXELS; i++) *sum += weight[i];
     return n;
 }
 
@@ -81,7 +89,7 @@ float dar_shadow_at(const dar_shadow *s, const float place[3], const float n[3])
 {
     const dar_view *v = &s->view;
     double at[3] = { 0 }, normal[3] = { 0 };
-    float wx[8], wy[8], sum_x, sum_y, lit = 0;
+    float wx[TEXELS], wy[TEXELS], sum_x, sum_y, lit = 0;
     int left, top;
 
     for (int k = 0; k < 3; k++)
@@ -92,17 +100,20 @@ float dar_shadow_at(const dar_shadow *s, const float place[3], const float n[3])
     float x = (float)(v->fx * at[0] / at[2] + v->cx), y = (float)(v->fy * at[1] / at[2] + v->cy);
     float side = (float)v->width, reach = s->reach;
     if (!(x > reach + 1 && y > reach + 1 && x < side - reach - 1 && y < side - reach - 1)) return 1;
-    int columns = tent(x, reach, wx, &sum_x, &left), rows = tent(y, reach, wy, &sum_y, &top);
+    tent(x, reach, wx, &sum_x, &left);
+    int rows = tent(y, reach, wy, &sum_y, &top);
 
-    /* Depth of the place's plane where texel (i, j) is: z + gx (i - x) + gy (j - y). */
-    float facing = fmaxf((float)-normal[2], 1e-6f);
-    float gx = fminf(fmaxf((float)normal[0] / facing, -STEEP), STEEP) * s->slope[0];
-    float gy = fminf(fmaxf((float)normal[1] / facing, -STEEP), STEEP) * s->slope[1];
+    /* Depth of the place's plane where texel (i, j) is: z + gx (i - x) + gy (j - y).  Columns behind the tent's weigh
+     * nothing: they may be those of the next row, which is there. */
+    float facing = dar_greaterf((float)-normal[2], 1e-6f);
+    float gx = dar_lesserf(dar_greaterf((float)normal[0] / facing, -STEEP), STEEP) * s->slope[0];
+    float gy = dar_lesserf(dar_greaterf((float)normal[1] / facing, -STEEP), STEEP) * s->slope[1];
     float z = (float)at[2] - s->bias;
     for (int j = 0; j < rows; j++) {
         const float *row = s->map.depth + (size_t)(top + j) * (size_t)v->width + left;
-        float line = z + gy * ((float)(top + j) + 0.5f - y) + gx * ((float)left + 0.5f - x), part = 0;
-        for (int i = 0; i < columns; i++) part += wx[i] * (float)(row[i] >= line + gx * (float)i || row[i] == 0);
+        float line = z + gy * ((float)(top + j) + 0.5f - y) + gx * ((float)left + 0.5f - x), part = 0, passed[TEXELS];
+        for (int i = 0; i < TEXELS; i++) passed[i] = (row[i] >= line + gx * (float)i) | (row[i] == 0) ? wx[i] : 0;
+        for (int i = 0; i < TEXELS; i++) part += passed[i];
         lit += wy[j] * part;
     }
     return lit / (sum_x * sum_y);

@@ -8,7 +8,8 @@
 size_t dar_texture_wrap(double i, size_t n, dar_wrap mode)
 {
     double m = (double)n;
-    if (mode == DAR_WRAP_CLAMP) return i < 0 ? 0 : i >= m ? n - 1 : (size_t)i;
+    if (i >= 0 && i < m) return (size_t)i; /* the same in every mode, without a division */
+    if (mode == DAR_WRAP_CLAMP) return i < 0 ? 0 : n - 1;
     double period = mode == DAR_WRAP_MIRROR ? 2 * m : m, k = i - period * floor(i / period);
     if (!(k >= 0 && k < period)) k = 0;
     size_t at = (size_t)k;
