@@ -131,7 +131,8 @@ $B/speed_%: $B/tests/speed_%.o $B/tests/rate.o $B/tests/bench_peak.o $B/libdar.a
 	@echo "LD $@"
 	@$(CC) -o $@ $(filter %.o,$^) $(filter %.a,$^) $(LDFLAGS) $(LIBS) -lcmocka
 
-$B/speed_sample: $(patsubst %.c,$B/%.o,$(wildcard tests/work_*.c)) $B/infer/dar_eval_html.o
+$B/speed_sample: $B/tests/work_scene.o $B/tests/work_held.o
+$B/speed_sample $B/test_front: $B/tests/work_table.o $B/tests/work_report.o $B/infer/dar_eval_html.o
 
 # The front is the model's own where nothing else is asked for.
 MODEL := models/dar-tiny

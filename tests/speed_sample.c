@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "data/png.h"
 #include "lib/dir.h"
 #include "lib/log.h"
 #include "lib/sha256.h"
@@ -16,7 +17,7 @@
 #define ROUNDS 15
 
 static const char *out, *model_path, *vae, *front_path;
-static int64_t size[2], frames, rounds, fine, scenes;
+static int64_t size[2], frames, rounds, fine, scenes, held;
 static double safety;
 static bool quick, only_report;
 static dar_common common;
@@ -40,8 +41,10 @@ static const dar_option options[] = {
       .hi = ROUNDS, .help = "videos of a row, of whose seconds the median is kept" },
     { .name = "fine", .placeholder = "N", .type = DAR_ARG_INT, .target = &fine, .standard = "200", .lo = 1,
       .hi = 1000, .help = "steps of the reference for the ODE" },
-    { .name = "safety", .placeholder = "X", .type = DAR_ARG_NUMBER, .target = &safety, .standard = "1.5", .lo = 1,
+    { .name = "safety", .placeholder = "X", .type = DAR_ARG_NUMBER, .target = &safety, .standard = "2", .lo = 1,
       .hi = 100, .help = "a setting's bound, in largest errors of any scene" },
+    { .name = "held", .placeholder = "N", .type = DAR_ARG_INT, .target = &held, .standard = "0", .lo = 0, .hi = 100000,
+      .help = "then try error budgets on N other scenes: held.csv; exit status 1 if one is exceeded" },
     { .name = "quick", .type = DAR_ARG_FLAG, .target = &quick, .help = "a few settings only" },
     { .name = "report", .type = DAR_ARG_FLAG, .target = &only_report, .help = "pages of what is there" },
 };
@@ -259,6 +262,15 @@ static dar_status open_model(struct job *j, int precision, bool plan, dar_model 
     return dar_model_open(m, &j->file, &o, e);
 }
 
+/* Beside the tables. */
+static dar_status write_picture(const work_scene *s, const char *name, const uint8_t *video, dar_err *e)
+{
+    char path[PATH_MAX];
+    const size_t w = (size_t)s->b->meta.width, h = (size_t)s->b->meta.height;
+    work_picture(out, s->name, name, path);
+    return dar_png_write(path, w, h, 3, video + (s->b->meta.frames - 1) * 3 * w * h, e);
+}
+
 static dar_status measure_row(struct job *j, const dar_model *m, const setting *set, work_scene *s, dar_err *e)
 {
     work_row row = { 0 };
@@ -275,6 +287,7 @@ static dar_status measure_row(struct job *j, const dar_model *m, const setting *
     row.v[WORK_GUIDANCE_TOLERANCE] = c->guidance_tolerance;
     DAR_TRY(run(j, m, set, s, j->latent, j->frames, (size_t)rounds, &row, e));
     DAR_TRY(work_compare(s, j->latent, j->frames, &row, e));
+    DAR_TRY(write_picture(s, set->name, j->frames, e));
     DAR_TRY(work_add(&j->table, &row, e));
     dar_progress_step(&j->progress, (double)++j->done, row.text[WORK_SETTING]);
     return DAR_OK;
@@ -342,6 +355,53 @@ static dar_status refer(struct job *j, const setting *set, size_t n, dar_err *e)
     return s;
 }
 
+/* ---------------------------------------------------------------- scenes that were held out */
+
+struct kept {
+    struct job *j;
+    dar_model *m[PRECISIONS]; /* NULL: not opened yet */
+};
+
+static dar_status render_held(void *ctx, int precision, const dar_sampler_config *c, work_scene *s, double *latent,
+                              uint8_t *pictures, double *seconds, double *estimate, dar_err *e)
+{
+    struct kept *k = ctx;
+    setting set = { .precision = precision, .c = *c };
+    work_row row = { 0 };
+    *seconds = 0;
+    if (!k->m[precision]) DAR_TRY(open_model(k->j, precision, false, &k->m[precision], e));
+    double begun = dar_log_clock();
+    dar_status status = run(k->j, k->m[precision], &set, s, latent, pictures, 1, &row, e);
+    *seconds = status == DAR_OK ? row.v[WORK_SECONDS] : dar_log_clock() - begun;
+    *estimate = row.v[WORK_ESTIMATE];
+    return status;
+}
+
+static dar_status hold(struct job *j, dar_err *e)
+{
+    const work_size how = { (int)size[0], (int)size[1], (size_t)frames, common.seed };
+    struct kept k = { .j = j };
+    dar_front f;
+    work_promise p;
+    dar_status s = DAR_OK;
+    work_front(&j->table, j->file.c.name, safety, &f);
+    j->progress = dar_progress_begin("held", "scenes", (double)held);
+    for (size_t i = 0; i < (size_t)held && s == DAR_OK; i++) {
+        s = work_held(&f, out, i, &how, &j->file.c, render_held, &k, e);
+        if (s == DAR_OK) dar_progress_step(&j->progress, (double)(i + 1), NULL);
+    }
+    for (int i = 0; i < PRECISIONS; i++) dar_model_close(k.m[i]);
+    if (s == DAR_OK) s = work_held_sum(out, &p, e);
+    if (s != DAR_OK) return s;
+    dar_progress_end(&j->progress);
+    dar_run_say(j->r,
+                "held out: %zu budgets, %zu exceeded; the largest error is %.2f of its budget, the longest time %.2f "
+                "of the full run's",
+                p.rows, p.broken, p.error, p.time);
+    if (!p.broken) return DAR_OK;
+    return dar_fail(e, DAR_ERR_CHECK, "%s/held.csv: %zu of %zu errors exceed their budgets", out, p.broken, p.rows);
+}
+
 /* ---------------------------------------------------------------- all */
 
 static dar_status read_model(struct job *j, dar_err *e)
@@ -369,11 +429,15 @@ static dar_status open_scenes(struct job *j, dar_err *e)
     size_t latent = 0, pixels = 0;
     snprintf(directory, sizeof directory, "%.*s/scenes", PATH_MAX - 16, out);
     DAR_TRY(dar_dir_make(directory, e));
+    snprintf(directory, sizeof directory, "%.*s/pictures", PATH_MAX - 16, out);
+    DAR_TRY(dar_dir_make(directory, e));
+    snprintf(directory, sizeof directory, "%.*s/scenes", PATH_MAX - 16, out);
     j->scenes = (size_t)scenes < work_scenes() ? (size_t)scenes : work_scenes();
     if (!(j->scene = calloc(j->scenes, sizeof *j->scene))) return dar_fail(e, DAR_ERR_NOMEM, "out of memory");
     for (size_t i = 0; i < j->scenes; i++) {
         work_scene *s = &j->scene[i];
         DAR_TRY(work_scene_open(s, i, directory, &how, &j->file.c, e));
+        DAR_TRY(write_picture(s, "truth", s->truth, e));
         size_t n = 3 * s->b->meta.frames * (size_t)(size[0] * size[1]);
         if (s->latent > latent) latent = s->latent;
         if (n > pixels) pixels = n;
@@ -407,6 +471,7 @@ static dar_status bench(dar_run *r, dar_err *e)
     if (s == DAR_OK && !only_report) s = measure(&j, e);
     if (s == DAR_OK && !common.dry_run) s = work_report(&j.table, out, j.file.c.name, safety, front_path, e);
     if (s == DAR_OK && !common.dry_run) dar_run_say(r, "%s/work_precision.html, .svg, .csv, .json; pareto.json", out);
+    if (s == DAR_OK && !common.dry_run && held) s = hold(&j, e);
     for (size_t i = 0; j.scene && i < j.scenes; i++) work_scene_close(&j.scene[i]);
     work_close(&j.table);
     dar_model_file_close(&j.file);

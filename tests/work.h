@@ -85,7 +85,7 @@ typedef struct work_size {
 } work_size;
 
 typedef struct work_scene {
-    const char *name, *help;
+    const char *name;
     char path[PATH_MAX];
     const char *text; /* with two prompts; NULL: none */
     size_t window;    /* in latent frames; 0: none */
@@ -106,6 +106,9 @@ size_t work_scenes(void);
 /* Scene i below `directory`, made if it is not there. */
 dar_status work_scene_open(work_scene *s, size_t i, const char *directory, const work_size *size,
                            const dar_config *model, dar_err *e);
+/* Scene i of those that the front was not made of. */
+dar_status work_scene_held(work_scene *s, size_t i, const char *directory, const work_size *size,
+                           const dar_config *model, dar_err *e);
 void work_scene_close(work_scene *s); /* accepts a zeroed one */
 
 /* References from the scene's file, if they are there and of this model. */
@@ -123,5 +126,27 @@ void work_front(const work_table *t, const char *model, double safety, dar_front
 /* work_precision.json, .svg, .html and pareto.json in `directory`; the last also as `front`, unless that is NULL. */
 dar_status work_report(const work_table *t, const char *directory, const char *model, double safety, const char *front,
                        dar_err *e);
+
+/* PATH of the picture of a setting on a scene, or of "truth": the last frame. */
+const char *work_picture(const char *directory, const char *scene, const char *setting, char path[PATH_MAX]);
+
+/* ---------------------------------------------------------------- whether promises are kept */
+
+/* Render s in this precision.  DAR_ERR_CHECK: it came to more than its budget. */
+typedef dar_status work_render(void *ctx, int precision, const dar_sampler_config *c, work_scene *s, double *latent,
+                               uint8_t *frames, double *seconds, double *estimate, dar_err *e);
+
+/* What dar-sample would do with several error budgets on scene i of those held out, if held.csv in `directory` does not
+ * say already: a row for each, and what it came to against the full run. */
+dar_status work_held(const dar_front *f, const char *directory, size_t i, const work_size *size,
+                     const dar_config *model, work_render *render, void *ctx, dar_err *e);
+
+/* Of the rows in held.csv: how many there are, how many exceed their budget, the largest share of it, and the largest
+ * time as a share of the full run's. */
+typedef struct work_promise {
+    size_t rows, broken;
+    double error, time;
+} work_promise;
+dar_status work_held_sum(const char *directory, work_promise *p, dar_err *e);
 
 #endif

@@ -3,13 +3,15 @@
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "infer/dar_eval_html.h"
 #include "lib/file.h"
 #include "lib/plot.h"
 #include "tests/work.h"
 
-#define MOST 128 /* settings; scenes */
+#define MOST     128  /* settings; scenes */
+#define ROUNDING 1e-6 /* an error below is not drawn */
 
 /* A setting over the scenes of a kind. */
 struct mean {
@@ -26,14 +28,15 @@ static bool of_kind(const work_row *r, int kind)
     return kind == DAR_FRONT_ANY || (r->v[WORK_CAMERA_STILL] > 0) == (kind == DAR_FRONT_STILL);
 }
 
+/* NaN stays. */
 static double larger(double a, double b)
 {
-    return !(a >= b) ? b : a;
+    return isnan(a) || isnan(b) ? NAN : fmax(a, b);
 }
 
 static double smaller(double a, double b)
 {
-    return !(a <= b) ? b : a;
+    return -larger(-a, -b);
 }
 
 /* Settings in the order in which they were first measured; returns how many. */
@@ -46,7 +49,7 @@ static size_t collect(const work_table *t, int kind, struct mean *m)
         for (i = 0; i < n && strcmp(m[i].row->text[WORK_SETTING], r->text[WORK_SETTING]) != 0; i++) continue;
         if (i == MOST) continue;
         if (i == n) {
-            m[n++] = (struct mean){ .row = r, .ssim = NAN, .psnr = NAN };
+            m[n++] = (struct mean){ .row = r, .ssim = INFINITY, .psnr = INFINITY };
             for (int c = 0; c < WORK_CLASSES; c++) m[i].class[c] = NAN;
         }
         m[i].scenes++;
@@ -186,7 +189,7 @@ static void collect_lines(struct drawing *d, const struct mean *m, size_t n, coo
         char label[3 * WORK_TEXT];
         size_t k = 0;
         bool tolerance = r->v[WORK_TOLERANCE] > DAR_FRONT_WATCH, guided = r->v[WORK_GUIDANCE_TOLERANCE] > 0;
-        if (strcmp(r->text[WORK_SKIPS], "all") != 0 || r->v[WORK_THREADS] > 0 || !(m[i].error > 0)) continue;
+        if (strcmp(r->text[WORK_SKIPS], "all") != 0 || r->v[WORK_THREADS] > 0 || !(m[i].error > ROUNDING)) continue;
         snprintf(label, sizeof label, "%s %s, %s%s", r->text[WORK_PRECISION], r->text[WORK_SOLVER],
                  tolerance ? "tolerance" : "steps", guided ? ", guidance" : "");
         while (k < d->lines && strcmp(d->line[k].label, label) != 0) k++;
@@ -202,7 +205,7 @@ static void collect_lines(struct drawing *d, const struct mean *m, size_t n, coo
     }
 }
 
-/* With noise floors if x is the error. */
+/* Settings in the order of time; with noise floors if x is the error. */
 static dar_status draw(struct drawing *d, const struct mean *m, size_t n, coordinate *x, const dar_plot_axis *axis,
                        char **svg, dar_err *e)
 {
@@ -211,7 +214,7 @@ static dar_status draw(struct drawing *d, const struct mean *m, size_t n, coordi
     dar_plot_series s[MOST + 3];
     size_t k = 0;
     collect_lines(d, m, n, x);
-    d->ends[0] = 0.05, d->ends[1] = 1;
+    d->ends[0] = n ? m[0].time : 1, d->ends[1] = 1;
     for (int i = 0; i < 3 && x == error_of; i++) {
         const struct mean *at = find(m, n, floors[i]);
         double where = !at ? NAN : i == 2 ? at->ode : at->error;
@@ -223,13 +226,9 @@ static dar_status draw(struct drawing *d, const struct mean *m, size_t n, coordi
     }
     for (size_t i = 0; i < d->lines; i++) {
         const struct line *l = &d->line[i];
-        s[k++] = (dar_plot_series){ .label = l->label,
-                                    .mark = DAR_PLOT_POINTS,
-                                    .colour = (int)i,
-                                    .n = l->n,
-                                    .x = l->x,
-                                    .y = l->y,
-                                    .tips = l->name };
+        s[k++] = (dar_plot_series){
+            .label = l->label, .mark = DAR_PLOT_BOTH, .colour = (int)i, .n = l->n, .x = l->x, .y = l->y, .tips = l->name
+        };
     }
     const dar_plot p = { .x = *axis,
                          .y = { "time, share of the full run's", true, 0, 0 },
@@ -316,6 +315,48 @@ static void table_scenes(FILE *f, const work_table *t)
     fputs("</table></div>\n", f);
 }
 
+/* ---------------------------------------------------------------- pictures */
+
+const char *work_picture(const char *directory, const char *scene, const char *setting, char path[PATH_MAX])
+{
+    snprintf(path, PATH_MAX, "%.*s/pictures/%s %s.png", PATH_MAX / 2, directory, scene, setting);
+    return path;
+}
+
+/* Nothing if there is no such picture. */
+static dar_status picture(FILE *f, const work_table *t, const char *directory, const char *scene, const char *setting,
+                          dar_err *e)
+{
+    char path[PATH_MAX];
+    const work_row *r = work_find(t, scene, setting), *full = work_find(t, scene, WORK_FULL);
+    if (access(work_picture(directory, scene, setting, path), R_OK) != 0) return DAR_OK;
+    fputs("<figure><img style=\"width:100%;image-rendering:pixelated\" alt=\"\" src=\"data:image/png;base64,", f);
+    DAR_TRY(dar_html_file(f, path, e));
+    fprintf(f, "\"><figcaption>%s", setting);
+    if (r && full && r != full)
+        fprintf(f, "<br>%.1f&times; faster, off by %.2g, %.1f dB", full->v[WORK_SECONDS] / r->v[WORK_SECONDS],
+                r->v[WORK_ERROR], r->v[WORK_PSNR]);
+    fputs("</figcaption></figure>\n", f);
+    return DAR_OK;
+}
+
+static dar_status pictures(FILE *f, const work_table *t, const char *directory, const dar_front *front, dar_err *e)
+{
+    const dar_front_row *any = &front->kind[DAR_FRONT_ANY];
+    fputs("<h2 id=pictures>The last frame</h2>\n", f);
+    for (size_t i = 0; i < t->n; i++) {
+        const char *scene = t->row[i].text[WORK_SCENE];
+        if (strcmp(t->row[i].text[WORK_SETTING], WORK_FULL) != 0) continue;
+        fprintf(f, "<h3>%s</h3><div class=plots style=\"grid-template-columns:repeat(auto-fill,minmax(200px,1fr))\">\n",
+                scene);
+        DAR_TRY(picture(f, t, directory, scene, "truth", e));
+        DAR_TRY(picture(f, t, directory, scene, WORK_FULL, e));
+        for (size_t k = any->settings; k-- > 0;) DAR_TRY(picture(f, t, directory, scene, any->setting[k].name, e));
+        fputs("</div>\n", f);
+    }
+    return DAR_OK;
+}
+
 static dar_status figure(FILE *f, struct drawing *d, const struct mean *m, size_t n, coordinate *x,
                          const dar_plot_axis *axis, const char *caption, dar_err *e)
 {
@@ -330,23 +371,30 @@ static const dar_plot_axis by_error = { "largest error of a scene: relative L2 o
 static const dar_plot_axis by_psnr = { "least PSNR of a scene against the full run [dB]", false, 0, 0 };
 static const dar_plot_axis by_change = { "mean change of PSNR against the bundle's own frames [dB]", false, 0, 0 };
 
-static dar_status print_page(FILE *f, const work_table *t, const dar_front *front, struct drawing *d, dar_err *e)
+static dar_status print_page(FILE *f, const work_table *t, const char *directory, const dar_front *front,
+                             struct drawing *d, dar_err *e)
 {
     struct mean m[MOST];
     const size_t n = collect(t, DAR_FRONT_ANY, m);
+    qsort(m, n, sizeof *m, by_time);
     dar_html_begin(f, "Run time against error");
     fputs("<header><h1>Run time against error</h1><p>", f);
     dar_html_text(f, t->n ? t->row[0].text[WORK_MODEL] : "");
     fprintf(f,
             ": %zu rows on %zu scenes. The full run is f32, 50 steps of Euler, no skip. Below and to the left is "
-            "better.</p></header>\n<main><div class=plots>\n",
+            "better.</p></header>\n<main>\n",
             t->n, front->kind[DAR_FRONT_ANY].scenes);
-    DAR_TRY(figure(f, d, m, n, error_of, &by_error,
-                   "Vertical: how far precisions are from each other, and the full run from what it approximates.", e));
+    DAR_TRY(
+        figure(f, d, m, n, error_of, &by_error,
+               "Vertical: how far precisions are from each other, and the full run from what it approximates. To use a "
+               "velocity again for some steps, by a fixed table, is to take fewer steps of Euler.",
+               e));
+    fputs("<div class=plots>\n", f);
     DAR_TRY(figure(f, d, m, n, psnr_of, &by_psnr, "Frames; to the right is better.", e));
     DAR_TRY(figure(f, d, m, n, change_of, &by_change, "What it costs against the truth; 0 is nothing.", e));
     fputs("</div>\n", f);
     table_front(f, front);
+    DAR_TRY(pictures(f, t, directory, front, e));
     table_scenes(f, t);
     table_all(f, m, n);
     fputs("</main></body></html>\n", f);
@@ -375,7 +423,7 @@ static dar_status write_page(const work_table *t, const char *directory, const d
     size_t size = 0;
     FILE *f = open_memstream(&text, &size);
     if (!f) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory for the page", directory);
-    dar_status s = print_page(f, t, front, d, e);
+    dar_status s = print_page(f, t, directory, front, d, e);
     if (fclose(f) != 0 && s == DAR_OK) s = dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory for the page", directory);
     if (s == DAR_OK) s = write_text(directory, "work_precision.html", text, e);
     free(text);
@@ -386,7 +434,9 @@ static dar_status write_svg(const work_table *t, const char *directory, struct d
 {
     struct mean m[MOST];
     char *svg;
-    DAR_TRY(draw(d, m, collect(t, DAR_FRONT_ANY, m), error_of, &by_error, &svg, e));
+    const size_t n = collect(t, DAR_FRONT_ANY, m);
+    qsort(m, n, sizeof *m, by_time);
+    DAR_TRY(draw(d, m, n, error_of, &by_error, &svg, e));
     dar_status s = write_text(directory, "work_precision.svg", svg, e);
     free(svg);
     return s;

@@ -16,9 +16,11 @@
 #define MOVES 0.01 /* of the scene's size: from frame to frame a pixel shows another point */
 #define WORDS 5    /* of a prompt that is drawn */
 
+#define HELD_STILL 3 /* of scenes that were held out, every third has a camera that stands */
+
 /* ---------------------------------------------------------------- making them */
 
-/* A camera that stands; one that stands far away. */
+/* A camera that stands; one far away; one above, for which the ground fills the frame. */
 static const dar_trajectory_kind stands = {
     "stands", "benchmark", false, { { 30, 30 }, { 0, 0 }, { 12, 12 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 1, 1 } }
 };
@@ -29,20 +31,26 @@ static const dar_trajectory_kind far = {
     { { -20, -20 }, { 40, 40 }, { 10, 10 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 8, 8 } }
 };
 
+static const dar_trajectory_kind overhead = {
+    "above",
+    "benchmark",
+    false,
+    { { -20, -20 }, { 40, 40 }, { 72, 72 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 1, 1 } }
+};
+
 /* clang-format off */
 static const struct recipe {
-    const char *name, *help, *path, *family; /* path NULL: `own` */
+    const char *name, *what, *path, *family; /* path NULL: `own`; both NULL: drawn, as the family is */
     const dar_trajectory_kind *own;
     dar_asset_set set;
     bool alone, prompts;
-    double reach;
     size_t frames, longer; /* frames: 0: as asked; longer: as many times the latent frames after the first */
 } recipes[] = {
     { "still",   "the camera stands, something moves", .family = "humanoid", .own = &stands, .alone = true },
     { "still-2", "the camera stands, a machine works", .family = "mechanism", .own = &stands },
     { "orbit",   "the camera goes around", "orbit-60", .family = NULL },
     { "dolly",   "the camera comes nearer", "dolly-15", .family = NULL },
-    { "close",   "the frame is full", "orbit-30", .reach = 0.5 },
+    { "close",   "the frame is full", .own = &overhead },
     { "empty",   "nearly nothing is seen", .own = &far, .alone = true },
     { "short",   "5 frames", "orbit-30", .frames = 5 },
     { "long",    "twice as long, through windows", "half-orbit", .longer = 2 },
@@ -79,7 +87,6 @@ static dar_status film(const struct recipe *r, const char *path, const work_size
     plan.path = r->own;
     plan.set = r->set;
     plan.alone = r->alone;
-    plan.reach = r->reach;
     plan.width = size->width, plan.height = size->height;
     plan.frames = frames_of(r, size);
     if (r->path) DAR_TRY(dar_trajectory_find(r->path, &plan.path, e));
@@ -215,9 +222,19 @@ dar_status work_scene_open(work_scene *s, size_t i, const char *directory, const
                            const dar_config *model, dar_err *e)
 {
     const struct recipe *r = &recipes[i];
-    *s = (work_scene){ .name = r->name, .help = r->help };
+    *s = (work_scene){ .name = r->name };
     if (r->longer) s->window = dar_rays_latent_frames(size->frames);
     return open_scene(s, r, directory, size, model, e);
+}
+
+dar_status work_scene_held(work_scene *s, size_t i, const char *directory, const work_size *size,
+                           const dar_config *model, dar_err *e)
+{
+    static const struct recipe still = { .name = "held", .own = &stands }, moving = { .name = "held" };
+    work_size own = *size;
+    own.seed = dar_rng_u64(size->seed, dar_rng_stream("held"), i) >> 12;
+    *s = (work_scene){ .name = "held" };
+    return open_scene(s, i % HELD_STILL ? &moving : &still, directory, &own, model, e);
 }
 
 void work_scene_close(work_scene *s)
