@@ -22,7 +22,7 @@ CFLAGS += $(CSTD) $(WARN) $(NUM) $(OMP) $(OPT_$(MODE))
 # The openmp flavour of OpenBLAS shares our thread pool; the default alternative (pthread) fights it.
 BLAS_DIR := $(firstword $(wildcard /usr/lib/*/openblas-openmp) /usr/lib)
 LDFLAGS  += $(OMP) $(filter -fsanitize=%,$(OPT_$(MODE))) -L$(BLAS_DIR) -Wl,-rpath,$(BLAS_DIR)
-LIBS     := -lopenblas -lcjson -lmeshoptimizer -lpng -ljpeg -lhdf5_serial -lOpenEXRCore -ldeflate -lm
+LIBS     := -lopenblas -lcjson -lmeshoptimizer -lpng -ljpeg -lhdf5_serial -lOpenEXRCore -ldeflate -lcrypto -lm
 
 # Instruction sets per file, read by the one compile rule.
 AVX2   := -mavx2 -mfma -mf16c

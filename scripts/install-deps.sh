@@ -1,7 +1,7 @@
 #!/bin/sh
 # install-deps.sh: install the Debian packages that are missing; quick and silent when none is.
 need="gcc make libc6-dev libopenblas-openmp-dev libcjson-dev libcmocka-dev
-libmeshoptimizer-dev libpng-dev libjpeg62-turbo-dev libhdf5-dev libdeflate-dev libopenexr-dev ffmpeg"
+libmeshoptimizer-dev libpng-dev libjpeg62-turbo-dev libhdf5-dev libdeflate-dev libssl-dev libopenexr-dev ffmpeg"
 # `make check` and `make fuzz` want clang too: scripts/install-deps.sh check
 [ "$1" = check ] && need="$need clang clang-format libomp-dev libclang-rt-14-dev"
 # the rule of `make check` that opens pages: scripts/install-deps.sh pages
