@@ -99,12 +99,12 @@ dar_val *dar_rope(dar_tape *t, dar_val *x, dar_val *table);
 void dar_rope_axes(int64_t e, int64_t pairs[3]);
 
 /* Angles [rad] of the E / 2 pairs of a token at (t, h, w): pair i of an axis with P pairs turns by position
- * 10000^(-i / P). */
-void dar_rope_angles(int64_t e, const double position[3], double *angle);
+ * base^(-i / P). */
+void dar_rope_angles(int64_t e, double base, const double position[3], double *angle);
 
 /* Fill table [frames height width, E], any float type, for tokens in the order t, h, w, all from 0.  Computed in f64.
  */
-void dar_rope_table(const dar_tensor *table, int64_t frames, int64_t height, int64_t width);
+void dar_rope_table(const dar_tensor *table, int64_t frames, int64_t height, int64_t width, double base);
 
 /* ---------------------------------------------------------------- products */
 

@@ -28,6 +28,7 @@ static void read_dit(dar_dit_config *c, dar_json j)
     c->frequencies = dar_json_int(j, "frequencies", 256, 2, MOST);
     c->text_width = dar_json_int(j, "text_width", 4096, 1, MOST);
     c->text_keys = dar_json_int(j, "text_keys", 512, 0, MOST);
+    c->rope_base = dar_json_number(j, "rope_base", 10000, 1, 1e9);
     c->eps = dar_json_number(j, "eps", 1e-6, 1e-30, 1);
     if (c->heads > 0 && (c->width % c->heads || c->width / c->heads < 6 || c->width / c->heads % 2))
         dar_json_reject(j, "heads", "a count whose share of %lld features is even and at least 6", (long long)c->width);

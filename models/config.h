@@ -14,6 +14,7 @@
  *   dit.frequencies    even            256      numbers that encode the time
  *   dit.text_width     1 ..            4096     features of a text token
  *   dit.text_keys      0 ..            512      keys that cross-attention sees: shorter texts are filled up with zeros
+ *   dit.rope_base      > 1             10000    the frequencies of the positions fall from 1 towards 1 / rope_base
  *   dit.eps            > 0             1e-6     of every norm
  *
  *   adapter.rays       0 ..            24       packed ray channels; 0 with no geometry: there is no adapter
@@ -75,7 +76,7 @@ typedef struct dar_dit_config {
     int64_t width, heads, layers, ffn;
     int64_t latent, mask, patch;
     int64_t frequencies, text_width, text_keys;
-    double eps;
+    double rope_base, eps;
 } dar_dit_config;
 
 #define DAR_ADAPTER_BLOCKS 8

@@ -49,7 +49,7 @@ void dar_dit_scene_prepare(dar_tape *t, const dar_dit *m, const dar_dit_clip *c,
         s->base = s->base ? dar_add(t, s->base, x) : x;
     }
     s->rope = dar_input(t, m->main, DAR_SHAPE(c->frames * s->frame, m->c.width / m->c.heads));
-    if (!t->arena->plan) dar_rope_table(&s->rope->x, c->frames, h, w);
+    if (!t->arena->plan) dar_rope_table(&s->rope->x, c->frames, h, w, m->c.rope_base);
 }
 
 /* ---------------------------------------------------------------- text */

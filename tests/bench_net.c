@@ -107,7 +107,7 @@ static void setup(bench *b)
     s->text = bench_tensor(b, type, DAR_SHAPE(1, b->s[2], 64));
     s->e0 = bench_tensor(b, type, DAR_SHAPE(1, 2, 6 * b->s[3]));
     s->rope = dar_tensor_push(b->arena, type, DAR_SHAPE(b->s[1], b->s[3] / b->s[4]));
-    dar_rope_table(&s->rope, b->s[1] / 256, 16, 16);
+    dar_rope_table(&s->rope, b->s[1] / 256, 16, 16, 10000);
 
     DAR_ASSERT(dar_arena_init_plan(&plan, "plan", &e) == DAR_OK, "%s", e.text);
     DAR_ASSERT(dar_arena_init_plan(&plan_keep, "plan", &e) == DAR_OK, "%s", e.text);

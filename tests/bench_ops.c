@@ -176,7 +176,7 @@ static void tokens_angles(bench *b)
 {
     bench_input(b, b->row->type, DAR_SHAPE(1, b->s[0], b->s[1] * b->s[2]), true);
     bench_input(b, DAR_F32, DAR_SHAPE(b->s[0], b->s[2]), false);
-    dar_rope_table(&b->x[1], b->s[0] / 512, 16, 32);
+    dar_rope_table(&b->x[1], b->s[0] / 512, 16, 32, 10000);
 }
 
 static dar_val *call_rope(dar_tape *t, dar_val *const *x, const int64_t *s)

@@ -27,6 +27,7 @@ static void presets_are_whole(void **state)
     }
     dar_config c = model_preset("wan22-fun-5b");
     assert_int_equal(dar_dit_channels(&c.dit), 100);
+    CHECK_NEAR("base of the public rotation", c.dit.rope_base, 10000, 0);
 }
 
 #define SIZES "\"width\": 48, \"heads\": 3, \"layers\": 2, \"ffn\": 96"
@@ -79,6 +80,7 @@ static void wrong_ones_are_told(void **state)
         { "{ \"name\": \"x\", \"dit\": { \"width\": 48, \"heads\": 12, \"layers\": 2, \"ffn\": 96 } }", "dit.heads" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES ", \"frequencies\": 7 } }", "even" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES ", \"eps\": 0 } }", "dit.eps" },
+        { "{ \"name\": \"x\", \"dit\": { " SIZES ", \"rope_base\": 0.5 } }", "dit.rope_base" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"adapter\": { \"widen\": \"zero\" } }", "copy, fresh" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"adapter\": { \"blocks\": 9 } }", "adapter.blocks" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"lora\": { \"targets\": [ \"q\" ] } }", "self_attn.q" },

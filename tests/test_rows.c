@@ -182,7 +182,7 @@ static void positions(void **state)
     CHECK(pairs[0] == 12 && pairs[1] == 10 && pairs[2] == 10, "pairs of 64");
 
     double a[64];
-    dar_rope_angles(128, (double[]){ 3, 5, 1023 }, a);
+    dar_rope_angles(128, 10000, (double[]){ 3, 5, 1023 }, a);
     CHECK_NEAR("first of time", a[0], 3, 0);
     CHECK_NEAR("last of time", a[21], 3 * pow(10000, -2 * 21 / 44.0), 1e-15); /* pos 10000^(-2i / 44) */
     CHECK_NEAR("first of height", a[22], 5, 0);
@@ -191,9 +191,9 @@ static void positions(void **state)
 
     static double table[2 * 3 * 5 * 128];
     dar_tensor t = dar_tensor_of(DAR_F64, DAR_SHAPE(2 * 3 * 5, 128), table);
-    dar_rope_table(&t, 2, 3, 5);
+    dar_rope_table(&t, 2, 3, 5, 100);
     for (int i = 0; i < 30; i++) { /* token i at frame i / 15, row i / 5 % 3, column i % 5 */
-        dar_rope_angles(128, (double[]){ i / 15, i / 5 % 3, i % 5 }, a);
+        dar_rope_angles(128, 100, (double[]){ i / 15, i / 5 % 3, i % 5 }, a);
         for (int j = 0; j < 64; j++) {
             CHECK_NEAR("cos", table[i * 128 + 2 * j], cos(a[j]), 0);
             CHECK_NEAR("sin", table[i * 128 + 2 * j + 1], sin(a[j]), 0);

@@ -368,7 +368,7 @@ static void positions_stay_exact(void **state)
 
         dar_tensor table = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(N, E)),
                    x = dar_tensor_push(&arena, DAR_F32, DAR_SHAPE(1, N, E));
-        dar_rope_table(&table, last[0], last[1], last[2]);
+        dar_rope_table(&table, last[0], last[1], last[2], 10000);
         dar_tensor_fill(&x, 0);
         float *v = x.data;
         for (int64_t i = 0; i < E; i += 2) v[(N - 1) * E + i] = 1; /* turns into (cos, sin) */

@@ -6,7 +6,6 @@
 #include "lib/thread.h"
 
 #define CHUNK 65536 /* elements per task */
-#define BASE  10000 /* of the frequencies */
 
 enum { X, TABLE };
 
@@ -19,18 +18,19 @@ void dar_rope_axes(int64_t e, int64_t pairs[3])
     pairs[0] = e / 2 - 2 * (e / 6);
 }
 
-void dar_rope_angles(int64_t e, const double position[3], double *angle)
+void dar_rope_angles(int64_t e, double base, const double position[3], double *angle)
 {
     int64_t pairs[3];
     dar_rope_axes(e, pairs);
     for (int axis = 0; axis < 3; axis++)
         for (int64_t i = 0; i < pairs[axis]; i++)
-            *angle++ = position[axis] * pow(BASE, -(double)i / (double)pairs[axis]);
+            *angle++ = position[axis] * pow(base, -(double)i / (double)pairs[axis]);
 }
 
 struct table {
     const dar_tensor *table;
     int64_t h, w;
+    double base;
 };
 
 static void table_rows(void *ctx, size_t begin, size_t end, int thread)
@@ -42,7 +42,8 @@ static void table_rows(void *ctx, size_t begin, size_t end, int thread)
     for (size_t i = begin; i < end; i++) {
         int64_t at = (int64_t)i;
         double position[] = { (double)(at / (p->h * p->w)), (double)(at / p->w % p->h), (double)(at % p->w) };
-        dar_rope_angles((int64_t)e, position, row + e / 2); /* the last pair is read before it is overwritten */
+        dar_rope_angles((int64_t)e, p->base, position,
+                        row + e / 2); /* the last pair is read before it is overwritten */
         for (size_t j = 0; j < e / 2; j++) {
             double a = row[e / 2 + j];
             row[2 * j] = cos(a);
@@ -52,9 +53,9 @@ static void table_rows(void *ctx, size_t begin, size_t end, int thread)
     }
 }
 
-void dar_rope_table(const dar_tensor *table, int64_t frames, int64_t height, int64_t width)
+void dar_rope_table(const dar_tensor *table, int64_t frames, int64_t height, int64_t width, double base)
 {
-    struct table p = { table, height, width };
+    struct table p = { table, height, width, base };
     size_t e = dar_tensor_cols(table);
     DAR_ASSERT(table->shape.n == 2 && table->shape.d[0] == frames * height * width && e <= DAR_PIECE,
                "rope_table: %lld rows of %zu for %lld x %lld x %lld tokens, heads at most %d",
