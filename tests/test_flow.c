@@ -282,13 +282,14 @@ struct ride {
 };
 
 /* Of several starts at once, so that the norm of z stays away from 0. */
-static struct ride ride(dar_solver_kind kind, double tolerance, size_t steps, field *f)
+static struct ride ride_within(dar_solver_kind kind, double tolerance, double budget, size_t steps, field *f)
 {
     struct ride r;
     dar_mark m = dar_arena_mark(&memory);
     dar_tensor z = vector(STARTS), v = vector(STARTS);
     double *at = z.data, *say = v.data;
-    dar_solver_config c = { .kind = kind, .grid = DAR_GRID_EVEN, .steps = steps, .shift = 1, .tolerance = tolerance };
+    dar_solver_config c = { .kind = kind, .grid = DAR_GRID_EVEN, .steps = steps, .shift = 1 };
+    c.tolerance = tolerance, c.budget = budget;
     dar_solver_init(&r.s, &c, &z, &memory);
     for (size_t i = 0; i <= steps; i++) r.s.sigma[i] = 0.95 - 0.9 * (double)i / (double)steps;
     for (int k = 0; k < STARTS; k++) at[k] = 0.95 * (k - 2) + 0.1;
@@ -299,6 +300,11 @@ static struct ride ride(dar_solver_kind kind, double tolerance, size_t steps, fi
     memcpy(r.end, at, sizeof r.end);
     dar_arena_reset(&memory, m);
     return r;
+}
+
+static struct ride ride(dar_solver_kind kind, double tolerance, size_t steps, field *f)
+{
+    return ride_within(kind, tolerance, 0, steps, f);
 }
 
 /* In the Euclidean norm, relative. */
@@ -346,6 +352,25 @@ static void test_tolerance_of_nothing(void **state)
         struct ride r = ride((dar_solver_kind)i, 1e-300, 40, normal_flow);
         assert_int_equal(r.s.calls, 40);
         assert_memory_equal(r.end, plain.end, sizeof r.end);
+    }
+}
+
+/* What is estimated stays within the budget, and the error with it: Euler's steps of one point are the plain run's. */
+static void test_budget(void **state)
+{
+    (void)state;
+    const double T = 1e-2;
+    struct ride plain = ride(DAR_EULER, 0, POINTS, normal_flow), free = ride(DAR_EULER, T, POINTS, normal_flow);
+    size_t before = free.s.calls;
+    for (double part = 0.5; part > 1e-3; part /= 8) {
+        double budget = part * free.s.estimate;
+        struct ride r = ride_within(DAR_EULER, T, budget, POINTS, normal_flow);
+        double off = apart(r.end, plain.end);
+        printf("euler, budget %.1e: %zu calls, error %.1e, estimate %.1e\n", budget, r.s.calls, off, r.s.estimate);
+        CHECK(r.s.estimate <= budget * (1 + 1e-12), "%g was estimated, of %g", r.s.estimate, budget);
+        CHECK(off <= budget, "%g is more than the budget %g", off, budget);
+        CHECK(r.s.calls > before && r.s.calls <= POINTS, "%zu calls, before %zu", r.s.calls, before);
+        before = r.s.calls;
     }
 }
 
@@ -434,6 +459,7 @@ int main(void)
         cmocka_unit_test(test_orders),
         cmocka_unit_test(test_tolerance),
         cmocka_unit_test(test_tolerance_of_nothing),
+        cmocka_unit_test(test_budget),
         cmocka_unit_test(test_guard),
         cmocka_unit_test(test_memory_and_types),
         cmocka_unit_test(test_one_step_too_many),

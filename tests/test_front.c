@@ -30,10 +30,11 @@ static void add(work_table *t, const char *scene, bool still, double visible, co
 static void add_scene(work_table *t, const char *scene, bool still, double visible, double worse)
 {
     add(t, scene, still, visible, WORK_FULL, "euler", 50, 0, 10, 0, 0);
-    add(t, scene, still, visible, "b euler-50", "euler", 50, 0, 4, 0.001 * worse, 0);
+    add(t, scene, still, visible, "bf16 euler-50", "euler", 50, 0, 4, 0.001 * worse, 0);
     add(t, scene, still, visible, "b T=0.1", "euler", 50, 0.1, 1 * worse, 0.01 * worse, 0.02);
     add(t, scene, still, visible, "b slow", "ab2", 20, 1e-12, 3, 0.02, 0.02);   /* others are better */
     add(t, scene, still, visible, "b euler-10", "euler", 10, 0, 0.1, 0.005, 0); /* nothing would guard it */
+    add(t, scene, still, visible, "b late", "ab2", 40, 1e-12, 7, 0.0001, 0.01); /* could take 1.1 with its guard */
     if (still) add(t, scene, still, visible, "b rare", "ab2", 9, 1e-12, 0.5, 0.05, 0.03);
 }
 
@@ -103,12 +104,12 @@ static void front(void **state)
     assert_int_equal(still->settings, 3);
     check_setting(still, 0, "b rare", 0.05, 0.05);
     check_setting(still, 1, "b T=0.1", sqrt(0.1 * 0.2), 0.02);
-    check_setting(still, 2, "b euler-50", 0.4, 0.002);
+    check_setting(still, 2, "bf16 euler-50", 0.4, 0.002);
     assert_int_equal(any->scenes, 3);
     assert_int_equal(any->settings, 3);
     check_setting(any, 0, "b T=0.1", 0.2, 0.04);
     check_setting(any, 1, "b slow", 0.3, 0.02);
-    check_setting(any, 2, "b euler-50", 0.4, 0.004);
+    check_setting(any, 2, "bf16 euler-50", 0.4, 0.004);
     CHECK_NEAR("visible", any->visible[1], 0.6, 0);
 
     ok(work_report(&t, directory, "m", 1.5, in_dir("front.json"), &e), &e);

@@ -85,14 +85,19 @@ static int by_time(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-/* What the sampler may choose: on all threads with all skips, and measured on every scene of the kind.  Its error can
- * be estimated while it runs, or it makes the full run's steps. */
-static bool eligible(const struct mean *m, size_t scenes)
+/* What the sampler may choose: on all threads with all skips, and measured on every scene of the kind.  It makes the
+ * full run's steps, all or those that its guard leaves; or its error is estimated, and if it is found out at the last
+ * step, all of those steps after it take no longer than the full run. */
+static bool eligible(const struct mean *m, size_t n, const struct mean *x, size_t scenes)
 {
-    const work_row *r = m->row;
-    const bool euler = strcmp(r->text[WORK_SOLVER], dar_solver_name[DAR_EULER]) == 0;
-    return r->v[WORK_THREADS] <= 0 && strcmp(r->text[WORK_SKIPS], "all") == 0 && m->scenes == scenes &&
-           (r->v[WORK_TOLERANCE] > 0 || (euler && r->v[WORK_STEPS] >= 50)) && isfinite(m->error);
+    const work_row *r = x->row;
+    char plain[2 * WORK_TEXT];
+    if (r->v[WORK_THREADS] > 0 || strcmp(r->text[WORK_SKIPS], "all") != 0) return false;
+    if (x->scenes != scenes || !isfinite(x->error)) return false;
+    if (strcmp(r->text[WORK_SOLVER], dar_solver_name[DAR_EULER]) == 0) return r->v[WORK_STEPS] >= 50;
+    snprintf(plain, sizeof plain, "%s euler-50", r->text[WORK_PRECISION]);
+    const struct mean *after = find(m, n, plain);
+    return r->v[WORK_TOLERANCE] > 0 && after && x->time + after->time <= 1;
 }
 
 static int index_of(const char *name, const char *const *names)
@@ -136,7 +141,7 @@ static void fill_row(const work_table *t, int kind, dar_front_row *row)
     qsort(m, n, sizeof *m, by_time);
     for (size_t i = 0; i < n && row->settings < DAR_FRONT_MOST; i++) {
         dar_front_setting s = setting_of(&m[i]);
-        if (!eligible(&m[i], scenes) || !(s.error < least[s.precision])) continue;
+        if (!eligible(m, n, &m[i], scenes) || !(s.error < least[s.precision])) continue;
         least[s.precision] = s.error;
         row->setting[row->settings++] = s;
     }
