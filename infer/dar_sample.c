@@ -1,9 +1,11 @@
 /* dar_sample.c: the program dar-sample: bundles, a picture and a model in, videos out. */
+#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <unistd.h>
 
 #include "data/pictures.h"
 #include "infer/front.h"
@@ -252,7 +254,11 @@ static dar_status choose_precision(struct job *j, const dar_model_file *f, dar_e
     if (!(o.error_budget > 0)) return DAR_OK;
     if (snprintf(path, sizeof path, "%.*sfront.json", slash ? (int)(slash + 1 - f->path) : 0, f->path) >= PATH_MAX)
         return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", f->path);
-    DAR_TRY(dar_front_open(&j->front, o.front ? o.front : path, f->c.name, e));
+    const char *front = o.front ? o.front : path;
+    if (access(front, R_OK) != 0)
+        return dar_fail(e, DAR_ERR_USAGE, "%s: %s: --error-budget expects what make bench measured of the model", front,
+                        strerror(errno));
+    DAR_TRY(dar_front_open(&j->front, front, f->c.name, e));
     DAR_TRY(look_at_bundles(j, e));
     for (int p = 0; p <= DAR_PIPELINE_INT8; p++) {
         double time = 0;
@@ -281,12 +287,16 @@ static void choose_setting(struct job *j, int bundle)
     if (j->chosen) dar_front_apply(&j->front, j->chosen, &j->how.sampler);
 }
 
-/* What was chosen and what came of it. */
+/* What was chosen and, unless ran is NULL, what came of it. */
 static void tell_choice(struct job *j, const char *path, const dar_sampler *ran, int bundle)
 {
     const dar_front_setting *s = j->chosen;
     dar_json_writer *w = &j->r->json;
+    char estimated[64] = "";
     if (!(o.error_budget > 0)) return;
+    if (s && ran && s->estimate > 0)
+        snprintf(estimated, sizeof estimated, "; estimated %.2g of %.2g allowed", ran->estimate,
+                 j->front.safety * s->estimate);
     dar_json_write_object(w, "error_budget");
     dar_json_write_number(w, "budget", o.error_budget);
     dar_json_write_text(w, "kind", dar_front_kind[j->kind[bundle]]);
@@ -302,9 +312,8 @@ static void tell_choice(struct job *j, const char *path, const dar_sampler *ran,
         dar_run_say(j->r, "%s: the estimated error of %s came to more than it ever did: 50 steps of euler", path,
                     s->name);
     else
-        dar_run_say(
-            j->r, "%s: %s, %.2f of the full run's time, error at most %.2g of %g; estimated %.2g of %.2g allowed", path,
-            s->name, s->time, j->front.safety * s->error, o.error_budget, ran->estimate, j->front.safety * s->estimate);
+        dar_run_say(j->r, "%s: %s, %.2f of the full run's time, error at most %.2g of %g%s", path, s->name, s->time,
+                    j->front.safety * s->error, o.error_budget, estimated);
 }
 
 static dar_status open_model(struct job *j, dar_err *e)
@@ -704,6 +713,7 @@ static dar_status sample_bundle(struct job *j, int bundle, dar_err *e)
     dar_status s = o.common.dry_run ? dar_pipeline_open(&p, j->m, &j->condition, path, b, &j->how, e)
                                     : make_videos(j, bundle, b, &p, e);
     if (p) tell_plan(j, p, path);
+    if (p && o.common.dry_run) tell_choice(j, path, NULL, bundle);
     dar_pipeline_close(p);
     dar_bundle_close(b);
     return s;
