@@ -176,6 +176,11 @@ static double error_of(const struct mean *m)
     return m->error;
 }
 
+static double ode_of(const struct mean *m)
+{
+    return m->ode;
+}
+
 static double psnr_of(const struct mean *m)
 {
     return m->psnr;
@@ -373,6 +378,7 @@ static dar_status figure(FILE *f, struct drawing *d, const struct mean *m, size_
 }
 
 static const dar_plot_axis by_error = { "largest error of a scene: relative L2 of the latent", true, 0, 0 };
+static const dar_plot_axis by_ode = { "largest error of a scene against the ODE", true, 0, 0 };
 static const dar_plot_axis by_psnr = { "least PSNR of a scene against the full run [dB]", false, 0, 0 };
 static const dar_plot_axis by_change = { "mean change of PSNR against the bundle's own frames [dB]", false, 0, 0 };
 
@@ -395,6 +401,7 @@ static dar_status print_page(FILE *f, const work_table *t, const char *directory
                "velocity again for some steps, by a fixed table, is to take fewer steps of Euler.",
                e));
     fputs("<div class=plots>\n", f);
+    DAR_TRY(figure(f, d, m, n, ode_of, &by_ode, "The same against f64 with many steps, which the full run is not.", e));
     DAR_TRY(figure(f, d, m, n, psnr_of, &by_psnr, "Frames; to the right is better.", e));
     DAR_TRY(figure(f, d, m, n, change_of, &by_change, "What it costs against the truth; 0 is nothing.", e));
     fputs("</div>\n", f);

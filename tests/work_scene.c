@@ -20,7 +20,7 @@
 
 /* ---------------------------------------------------------------- making them */
 
-/* A camera that stands; one far away; one above, for which the ground fills the frame. */
+/* A camera that stands; one far away; one above, for which the frame is fuller. */
 static const dar_trajectory_kind stands = {
     "stands", "benchmark", false, { { 30, 30 }, { 0, 0 }, { 12, 12 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 0, 0 }, { 1, 1 } }
 };
@@ -50,7 +50,7 @@ static const struct recipe {
     { "still-2", "the camera stands, a machine works", .family = "mechanism", .own = &stands },
     { "orbit",   "the camera goes around", "orbit-60", .family = NULL },
     { "dolly",   "the camera comes nearer", "dolly-15", .family = NULL },
-    { "close",   "the frame is full", .own = &overhead },
+    { "above", "seen from above, the frame is fuller", .own = &overhead },
     { "empty",   "nearly nothing is seen", .own = &far, .alone = true },
     { "short",   "5 frames", "orbit-30", .frames = 5 },
     { "long",    "twice as long, through windows", "half-orbit", .longer = 2 },
