@@ -38,6 +38,7 @@ static struct {
     int64_t count, size[2], frames;
     double fps;
     int set;
+    bool coarse;
     dar_common common;
 } o;
 
@@ -53,6 +54,9 @@ static const dar_option options[] = {
       .help = "number of bundles (default: all of the set; of train 100)" },
     { .name = "family", .placeholder = "NAME", .type = DAR_ARG_TEXT, .target = &o.family,
       .help = "train: subjects of this family only, such as humanoid, quadruped, vehicle, mechanism, cloth" },
+    { .name = "coarse", .type = DAR_ARG_FLAG, .target = &o.coarse,
+      .help = "for small networks and pictures: one subject with little around it, seen from near, in patterns of few "
+      "and large figures" },
     { .name = "size", .placeholder = "WxH", .type = DAR_ARG_SIZE, .target = o.size, .standard = "224x128",
       .lo = 16, .hi = DAR_RASTER_MAX_SIDE / DAR_SHADE_SAMPLES, .help = "of the pictures [px]" },
     { .name = "frames", .placeholder = "N", .type = DAR_ARG_INT, .target = &o.frames, .standard = "17",
@@ -121,6 +125,7 @@ static void say_what(const dar_synth *s, dar_json_writer *w)
     dar_json_write_text(w, "kind", s->thing[0].kind->name);
     dar_json_write_text(w, "family", s->thing[0].kind->family);
     dar_json_write_text(w, "asked", o.family ? o.family : ANY);
+    if (o.coarse) dar_json_write_bool(w, "coarse", true);
     dar_json_write_text(w, "lights", s->lights);
     dar_json_write_int(w, "things", (int64_t)s->things);
     dar_json_write_int(w, "dropped", (int64_t)s->dropped);
@@ -284,6 +289,7 @@ static dar_status check_found(const struct job *j, size_t index, const char *pat
         { "--frames", dar_json_int(root, "frames", 0, 0, INT32_MAX) == (int64_t)p.frames },
         { "--fps", dar_json_number(root, "fps", 0, 0, INFINITY) == p.fps },
         { "--family", strcmp(dar_json_text(made, "asked", ANY), o.family ? o.family : ANY) == 0 },
+        { "--coarse", dar_json_bool(made, "coarse", false) == p.coarse },
         { "--set or --seed", (uint64_t)dar_json_int(root, "seed", -1, 0, DAR_BUNDLE_MAX_SEED) == p.seed &&
                                  (!p.subject || strcmp(dar_json_text(made, "kind", ""), p.subject->name) == 0) },
     };
@@ -401,6 +407,7 @@ static dar_status write_manifest(struct job *j, struct manifest *m, dar_err *e)
     dar_json_write_int(&m->w, "height", j->plan.height);
     dar_json_write_int(&m->w, "frames", (int64_t)j->plan.frames);
     dar_json_write_number(&m->w, "fps", j->plan.fps);
+    if (o.coarse) dar_json_write_bool(&m->w, "coarse", true);
     dar_json_write_array(&m->w, "list");
     for (size_t i = 0; i < j->count; i++) DAR_TRY(list_one(m, i, e));
     dar_json_write_end(&m->w);
@@ -477,6 +484,7 @@ static dar_status prepare(struct job *j, const dar_run *r, dar_err *e)
     j->plan.width = (int)o.size[0], j->plan.height = (int)o.size[1];
     j->plan.frames = (size_t)o.frames;
     j->plan.fps = o.fps;
+    j->plan.coarse = o.coarse;
     return DAR_OK;
 }
 

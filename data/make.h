@@ -28,7 +28,8 @@
 #define DAR_MAKE_PAINTS    128
 #define DAR_MAKE_SKINS     32
 #define DAR_MAKE_MOVERS    2048
-#define DAR_MAKE_TARGETS   8   /* of one mesh */
+#define DAR_MAKE_TARGETS   8 /* of one mesh */
+#define DAR_MAKE_COARSE    0.4
 #define DAR_MAKE_SIDE      128 /* of a texture [px] */
 
 /* One property of one node over time, in addition to its rest value:
@@ -53,11 +54,12 @@ typedef struct dar_maker {
     double fps;
     dar_dice look; /* of the paints: others give the same things in other colours */
     bool bare;     /* paints are left out: geometry alone is wanted */
+    bool coarse;   /* patterns are of few and large figures, without fine lines */
 
     /* In force for the shapes that follow. */
     double at[12];  /* shape to mesh */
     int paint;      /* material */
-    double density; /* repeats of the texture per metre */
+    double density; /* repeats of the texture per metre; coarse: DAR_MAKE_COARSE of it */
     int joint;      /* that carries them; DAR_NONE: the mesh has no skin */
 
     dar_mover *mover;

@@ -9,6 +9,9 @@
 #define GRAIN 32 /* cells of fine noise across a texture */
 #define TABLE 1024
 
+#define FINE                                                                                                           \
+    (1u << DAR_PATTERN_BRICKS | 1u << DAR_PATTERN_TILES | 1u << DAR_PATTERN_WOOD) /* patterns with thin lines */
+
 /* sRGB: two that fill, one that accents, one that is dark or light. */
 static const uint32_t palettes[][4] = {
     { 0xe76f51, 0xf4a261, 0x2a9d8f, 0x264653 }, { 0xf1faee, 0xa8dadc, 0xe63946, 0x1d3557 },
@@ -150,9 +153,10 @@ static void paint_row(void *ctx, size_t row, int thread)
 
 /* ---------------------------------------------------------------- a draw */
 
-static dar_pattern draw_pattern(dar_dice *d, unsigned wanted)
+static dar_pattern draw_pattern(dar_dice *d, unsigned wanted, bool coarse)
 {
     unsigned all = (1u << DAR_PATTERNS) - 1, any = wanted ? wanted & all : all;
+    if (coarse) any = any & ~FINE ? any & ~FINE : all & ~FINE;
     for (;;) {
         size_t i = dar_dice_below(d, DAR_PATTERNS);
         if (any >> i & 1) return (dar_pattern)i;
@@ -189,7 +193,7 @@ int dar_make_paint(dar_maker *m, const dar_paint_style *style)
 {
     dar_scene *s = m->scene;
     dar_dice *d = &m->look;
-    struct paint p = { .pattern = draw_pattern(d, style->patterns) };
+    struct paint p = { .pattern = draw_pattern(d, style->patterns, m->coarse) };
     draw_colors(&p, d, style);
     dar_material material = {
         .name = "paint", .color = { 1, 1, 1, 1 }, .image = DAR_NONE, .double_sided = style->double_sided
@@ -200,6 +204,7 @@ int dar_make_paint(dar_maker *m, const dar_paint_style *style)
     p.k = 1 + (int)dar_dice_below(d, 3);
     p.share = dar_dice_in(d, 0.3, 0.6);
     p.grain = dar_dice_in(d, 0.04, 0.14);
+    if (m->coarse) p.n = p.k = 1, p.grain = 0;
     uint64_t stream = dar_rng_stream("paint noise"), seed = dar_rng_u64(d->seed, d->stream, d->next++);
     for (uint64_t i = 0; i < TABLE; i++) p.noise[i] = 2 * dar_rng_f32(seed, stream, i) - 1;
     p.rgba = dar_arena_push(&s->memory, (size_t)4 * SIDE * SIDE);

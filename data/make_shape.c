@@ -9,10 +9,16 @@
 #define FINE      20 /* quads around what is round */
 #define ROUND_END 3  /* quads along the round end of a tube */
 
+/* Of the texture, per metre. */
+static double density(const dar_maker *m)
+{
+    return m->coarse ? DAR_MAKE_COARSE * m->density : m->density;
+}
+
 /* Repeats of the texture along a length: whole ones where the sheet closes. */
 static double repeats(const dar_maker *m, double length, bool closed)
 {
-    double scale = sqrt(dar_vec_dot(m->at, m->at)), n = fabs(length) * scale * m->density;
+    double scale = sqrt(dar_vec_dot(m->at, m->at)), n = fabs(length) * scale * density(m);
     return closed ? fmax(1, floor(n + 0.5)) : n;
 }
 
@@ -200,8 +206,8 @@ void dar_make_disc(dar_maker *m, double radius)
     dar_make_sheet(m, &(dar_sheet_shape){ .rows = 1,
                                           .columns = 3 * FINE,
                                           .closed_u = true,
-                                          .repeat_u = m->density,
-                                          .repeat_v = m->density,
+                                          .repeat_u = density(m),
+                                          .repeat_v = density(m),
                                           .planar = true,
                                           .point = lathe_point,
                                           .ctx = &p });

@@ -76,7 +76,7 @@ static void add_things(struct work *w)
     const dar_asset_kind *subject = w->plan->subject ? w->plan->subject : draw_kind(w->plan->set, true, d);
     bool indoors = strcmp(subject->family, "interior") == 0;
     size_t others = dar_dice_below(d, 3), stills = 1 + dar_dice_below(d, STILLS - 2), n = 0;
-    if (w->plan->alone) others = 0, stills = stills / 2;
+    if (w->plan->alone || w->plan->coarse) others = 0, stills = stills / 2;
     add_thing(w, subject, n++);
     for (size_t i = 0; i < others && !indoors; i++) add_thing(w, draw_kind(w->plan->set, false, d), n++);
     for (size_t i = 0; i < stills && !indoors; i++)
@@ -279,7 +279,7 @@ static dar_box *cover_subject(struct work *w, const dar_box *things)
 {
     dar_dice d = dar_dice_for(w->plan->seed, "frame", 0);
     dar_box *box = room(w, w->plan->frames, sizeof *box);
-    double share = dar_dice_in(&d, 0, 0.6);
+    double share = dar_dice_in(&d, 0, w->plan->coarse ? 0.1 : 0.6);
     for (size_t t = 0; t < w->plan->frames; t++) {
         box[t] = w->out->thing[0].box[t];
         for (int k = 0; k < 3; k++) {
@@ -348,6 +348,7 @@ static dar_status find_path(struct work *w, dar_err *e)
     dar_stage things = all, near = all;
     things.box = cover_things(w);
     near.box = cover_subject(w, things.box);
+    if (p->coarse) near.margin = 0;
     if (r > 0) all.box = &within, near.box = &amid, all.boxes = near.boxes = 1;
     DAR_TRY(dar_camera_init(&o->cameras, p->frames, e));
     for (o->paths = 0; o->paths < PATHS; o->paths++) {
@@ -369,6 +370,7 @@ dar_status dar_synth_make(dar_synth *s, const dar_synth_plan *plan, dar_err *e)
     DAR_ASSERT(plan->frames >= 1 && plan->fps > 0, "synth: %zu frames, %g a second", plan->frames, plan->fps);
     DAR_TRY(dar_make_open(&w.maker, &s->scene, plan->frames, plan->fps, e));
     w.maker.bare = plan->bare;
+    w.maker.coarse = plan->coarse;
     s->box = room(&w, plan->frames, sizeof *s->box);
     add_things(&w);
     dar_make_close(&w.maker);

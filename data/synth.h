@@ -28,6 +28,7 @@ typedef struct dar_synth_plan {
     const dar_asset_kind *subject;   /* NULL: drawn from the set */
     const dar_trajectory_kind *path; /* NULL: drawn from the archetypes, all but those of the benchmark */
     bool alone;                      /* no second thing that moves by itself, and few others */
+    bool coarse;                     /* alone, seen from nearer, in patterns of few and large figures */
     double reach;      /* > 0: the camera goes around this box, whatever is in it: x, z to +-reach, y to reach [m] */
     int width, height; /* [px] */
     size_t frames;

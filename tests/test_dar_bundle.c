@@ -480,6 +480,7 @@ static void another_set(void **state)
         { "--seed=4", "another --set or --seed" }, { "--set=refvar", "another --set or --seed" },
         { "--size=32x32", "another --size" },      { "--frames=6", "another --frames" },
         { "--fps=24", "another --fps" },           { "--family=vehicle", "another --family" },
+        { "--coarse", "another --coarse" },
     };
     GOOD(FEW, "-o", "few");
     for (size_t i = 0; i < DAR_COUNT(other); i++) {

@@ -321,6 +321,59 @@ static void looks_separate(void **state)
     dar_synth_free(&first);
 }
 
+/* Steps from one texel to the next, in all textures of a scene. */
+static double roughness(const dar_scene *s)
+{
+    double sum = 0;
+    for (size_t i = 0; i < s->images; i++)
+        for (size_t k = 4; k < (size_t)4 * DAR_MAKE_SIDE * DAR_MAKE_SIDE; k++)
+            sum += abs(s->image[i].rgba[k] - s->image[i].rgba[k - 4]);
+    return sum / fmax(1, (double)s->images);
+}
+
+/* Largest angle at which the camera sees the subject, over the clip [rad]. */
+static double angle(const dar_synth *s)
+{
+    double most = 0;
+    for (size_t t = 0; t < T; t++) {
+        const dar_box *b = &s->thing[0].box[t];
+        double far = 0, size = 0;
+        for (int k = 0; k < 3; k++) {
+            far += pow(s->cameras.view[t].c2w[4 * k + 3] - (b->lo[k] + b->hi[k]) / 2, 2);
+            size += pow(b->hi[k] - b->lo[k], 2);
+        }
+        most = fmax(most, 2 * atan(sqrt(size / far) / 2));
+    }
+    return most;
+}
+
+/* Scenes for small networks: the same subject alone, nearer, in plainer patterns, and still in view. */
+static void coarse_is_plain(void **state)
+{
+    (void)state;
+    double rough[2] = { 0 }, large[2] = { 0 };
+    size_t seen = 0, scenes = 60;
+    for (uint64_t seed = 0; seed < scenes; seed++)
+        for (int coarse = 0; coarse < 2; coarse++) {
+            dar_synth s;
+            dar_synth_plan p = plan_of(seed);
+            p.coarse = coarse, p.bare = false;
+            make(&s, &p);
+            rough[coarse] += roughness(&s.scene), large[coarse] += angle(&s);
+            for (size_t i = 1; coarse && i < s.things; i++)
+                CHECK(strcmp(s.thing[i].kind->family, "object") == 0, "seed %d: %s is there", (int)seed,
+                      s.thing[i].kind->name);
+            for (size_t t = 0; coarse && t < T; t++)
+                seen += dar_trajectory_in_view(&s.cameras.view[t], &s.thing[0].box[t], -0.001);
+            dar_synth_free(&s);
+        }
+    printf("coarse: textures %.2f as rough, subjects %.2f as large, seen in %zu of %zu frames\n", rough[1] / rough[0],
+           large[1] / large[0], seen, scenes * T);
+    CHECK(rough[1] < 0.6 * rough[0] && large[1] > 1.2 * large[0], "roughness %g, size %g", rough[1] / rough[0],
+          large[1] / large[0]);
+    CHECK(100 * seen >= 99 * scenes * T, "the subject is in view in %zu of %zu frames", seen, scenes * T);
+}
+
 /* ---------------------------------------------------------------- shapes */
 
 /* A closed shape about the origin: its faces look outwards. */
@@ -377,6 +430,7 @@ int main(void)
         cmocka_unit_test(sets_are_whole),
         cmocka_unit_test(motion_separates),
         cmocka_unit_test(looks_separate),
+        cmocka_unit_test(coarse_is_plain),
         cmocka_unit_test(attempts_stay_apart),
         cmocka_unit_test(rejected_cells_move_on),
     };
