@@ -10,6 +10,7 @@ MESH=${MESH:-} REFERENCE=${REFERENCE:-}
 NAME=$(basename "${MESH%.*}")
 OUT=${OUT:-out/demo}${MESH:+-$NAME}
 SIZE=${SIZE:-224x128}
+SET=${SET:---coarse}                     # other options of dar-bundle synth, as in pretrain.sh
 FRAMES=${FRAMES:-17}
 SAMPLE=${SAMPLE:---steps 20}             # options of dar-sample
 STEPS=${STEPS:-100}                      # of each training: some 5 minutes in all on two cores
@@ -87,8 +88,9 @@ mesh() {
 
 scenes() {
     say "scenes that were not in training"
+    # shellcheck disable=SC2086
     "$BIN/dar-bundle" synth -o "$OUT/scenes" --set 4d_vis --seed 2026 --count "$COUNT" --size "$SIZE" \
-        --frames "$FRAMES"
+        --frames "$FRAMES" $SET
     shown=
     for k in $SHOWN; do shown="$shown $(bundle "$k")"; done
 
@@ -99,7 +101,8 @@ scenes() {
     sample camera "$MODEL/backbone" $shown
 
     say "depth: $STEPS steps from the backbone that sees rays alone"
-    "$BIN/dar-bundle" synth -o "$OUT/clips" --seed 2026 --count "$CLIPS" --size "$SIZE" --frames "$FRAMES"
+    # shellcheck disable=SC2086
+    "$BIN/dar-bundle" synth -o "$OUT/clips" --seed 2026 --count "$CLIPS" --size "$SIZE" --frames "$FRAMES" $SET
     train depth depth "$MODEL/backbone" "[\"$OUT/clips\"]" 'validation.data=[]'
     # shellcheck disable=SC2086
     sample depth "$OUT/train/depth/checkpoint-$STEPS" $shown

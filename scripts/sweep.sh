@@ -36,12 +36,12 @@ SAMPLE=${SAMPLE:-$sample}
 fifth=$((STEPS / 5))
 case $SCALE in
 paper)
-    CONFIGS=${CONFIGS:-$PWD/train/configs/wan22-fun-5b} DATA=${DATA:-$OUT/data} SIZE=${SIZE:---size 832x480 --frames 81}
+    CONFIGS=${CONFIGS:-$PWD/train/configs/wan22-fun-5b} DATA=${DATA:-$OUT/data} SET=${SET:---size 832x480 --frames 81}
     backbone=wan22-fun-5b weights="\"$WEIGHTS\"" codec="--weights $WEIGHTS" warmup=200
     ;;
 *)
     [ "$SCALE" = smoke ] && DATA=${DATA:-$OUT/data}
-    CONFIGS=${CONFIGS:-$PWD/train/configs/dar-tiny} DATA=${DATA:-out/data} SIZE=${SIZE:-}
+    CONFIGS=${CONFIGS:-$PWD/train/configs/dar-tiny} DATA=${DATA:-out/data} SET=${SET:---coarse}
     backbone=$MODEL/backbone weights=null codec= warmup=$((STEPS / 20))
     ;;
 esac
@@ -52,7 +52,7 @@ say() {
 
 synth() {
     # shellcheck disable=SC2046,SC2086
-    "$BIN/dar-bundle" synth -o "$DATA/$1" --set "$1" $SIZE $([ "$2" = 0 ] || echo --count "$2")
+    "$BIN/dar-bundle" synth -o "$DATA/$1" --set "$1" $SET $([ "$2" = 0 ] || echo --count "$2")
 }
 
 # For every run: CALL NAME SET MODE SEED
