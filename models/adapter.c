@@ -40,7 +40,7 @@ void dar_adapter_init(dar_adapter *a, dar_params *p, const dar_adapter_config *c
     *a = (dar_adapter){ .c = *c, .width = width, .storage = p->storage, .main = p->main, .group = GROUP };
     if (!channels) return;
     DAR_ASSERT(c->blocks <= DAR_ADAPTER_BLOCKS, "adapter: %lld blocks", (long long)c->blocks);
-    a->w = declare(p, true, DAR_FRESH_UNIFORM, spread, DAR_SHAPE(width, channels, 2, 2), "conv.weight");
+    a->w = declare(p, true, DAR_FRESH_UNIFORM, c->spread * spread, DAR_SHAPE(width, channels, 2, 2), "conv.weight");
     a->b = declare(p, false, DAR_FRESH_UNIFORM, spread, DAR_SHAPE(width), "conv.bias");
     for (int i = 0; i < c->blocks; i++) declare_block(a, p, i);
 }

@@ -30,6 +30,7 @@ static void read_dit(dar_dit_config *c, dar_json j)
     c->text_keys = dar_json_int(j, "text_keys", 512, 0, MOST);
     c->rope_base = dar_json_number(j, "rope_base", 10000, 1, 1e9);
     c->eps = dar_json_number(j, "eps", 1e-6, 1e-30, 1);
+    c->precondition = dar_json_bool(j, "precondition", false);
     if (c->heads > 0 && (c->width % c->heads || c->width / c->heads < 6 || c->width / c->heads % 2))
         dar_json_reject(j, "heads", "a count whose share of %lld features is even and at least 6", (long long)c->width);
     if (c->frequencies % 2) dar_json_reject(j, "frequencies", "an even number");
@@ -42,6 +43,7 @@ static void read_adapter(dar_adapter_config *c, dar_json j)
     c->geometry = dar_json_int(j, "geometry", 0, 0, MOST);
     c->unshuffle = dar_json_int(j, "unshuffle", 16, 1, 256);
     c->blocks = dar_json_int(j, "blocks", 1, 0, DAR_ADAPTER_BLOCKS);
+    c->spread = dar_json_number(j, "spread", 1, 1e-6, 1e6);
     c->widen = (dar_widen)dar_json_choice(j, "widen", DAR_WIDEN_COPY, widen);
 }
 

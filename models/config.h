@@ -16,11 +16,14 @@
  *   dit.text_keys      0 ..            512      keys that cross-attention sees: shorter texts are filled up with zeros
  *   dit.rope_base      > 1             10000    the frequencies of the positions fall from 1 towards 1 / rope_base
  *   dit.eps            > 0             1e-6     of every norm
+ *   dit.precondition   true | false    false    what the network adds to the best linear guess of the velocity, else
+ * the velocity itself (dar_dit_velocity)
  *
  *   adapter.rays       0 ..            24       packed ray channels; 0 with no geometry: there is no adapter
  *   adapter.geometry   0 ..            0        N: geometry channels after them
  *   adapter.unshuffle  1 ..            16       r: a token sees 2 r x 2 r pixels
  *   adapter.blocks     0 .. 8          1        residual blocks; the public weights have 1, the paper's count fits 2
+ *   adapter.spread     > 0             1        fresh weights of its 2x2 convolution are those of nn.Conv2d, times this
  *   adapter.widen      copy | fresh    copy     what becomes of weights for fewer channels: copied, with zeros for the
  *                                               new ones, so that nothing changes at first; or made anew
  *
@@ -77,6 +80,7 @@ typedef struct dar_dit_config {
     int64_t latent, mask, patch;
     int64_t frequencies, text_width, text_keys;
     double rope_base, eps;
+    bool precondition;
 } dar_dit_config;
 
 #define DAR_ADAPTER_BLOCKS 8
@@ -85,6 +89,7 @@ typedef enum dar_widen { DAR_WIDEN_COPY, DAR_WIDEN_FRESH } dar_widen;
 
 typedef struct dar_adapter_config {
     int64_t rays, geometry, unshuffle, blocks;
+    double spread;
     dar_widen widen;
 } dar_adapter_config;
 

@@ -188,10 +188,25 @@ dar_val *dar_dit_head(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, con
     return dar_segment(t, head, a, (dar_val *[]){ tokens, rows }, 2, m->main, a->latent);
 }
 
+dar_val *dar_dit_velocity(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, dar_val *y, dar_val *z,
+                          const dar_dit_time *time)
+{
+    int64_t B = s->latent.d[0], F = y->x.shape.d[2], first = s->latent.d[2] - F;
+    if (!m->c.precondition) return y;
+    dar_val *guess = dar_input(t, m->main, DAR_SHAPE(B, 1, F, 1, 1)), *gain = dar_input(t, m->main, guess->x.shape);
+    for (int64_t i = 0; i < B * F && !t->arena->plan; i++) {
+        int64_t f = first + i % F, row = f < time->rows ? f : time->rows - 1;
+        double sigma = time->t[i / F * time->rows + row] / 1000, n = sigma * sigma + (1 - sigma) * (1 - sigma);
+        dar_dtype_set(m->main, guess->x.data, (size_t)i, (2 * sigma - 1) / n);
+        dar_dtype_set(m->main, gain->x.data, (size_t)i, 1 / sqrt(n));
+    }
+    return dar_add(t, dar_mul(t, y, gain), dar_mul(t, dar_slice(t, z, 2, first, F), guess));
+}
+
 dar_val *dar_dit_forward(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x, dar_val *z,
                          const dar_dit_time *time)
 {
     dar_dit_moment e = dar_dit_time_embed(t, m, s->latent.d[0], time);
     dar_val *tokens = dar_dit_embed(t, m, s, z);
-    return dar_dit_head(t, m, s, &e, dar_dit_blocks(t, m, s, x, &e, tokens));
+    return dar_dit_velocity(t, m, s, dar_dit_head(t, m, s, &e, dar_dit_blocks(t, m, s, x, &e, tokens)), z, time);
 }

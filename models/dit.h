@@ -139,6 +139,17 @@ dar_val *dar_dit_blocks_end(dar_tape *t, const dar_dit *m, const dar_dit_scene *
 /* Of a scene that is held: tokens without those of the first frame, velocity without it. */
 dar_val *dar_dit_head(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e, dar_val *tokens);
 
+/* The head's result y as a velocity; y itself unless m->c.precondition.  Then, with s = time / 1000,
+ *
+ *     v = ((2 s - 1) z + y sqrt(n)) / n,    n = s^2 + (1 - s)^2
+ *
+ * where the first term is the best linear guess of v = noise - x from z = (1 - s) x + s noise for x of unit variance,
+ * and y what is left of it, of unit variance at every s.  Noise need not pass through the network to be subtracted,
+ * which a network hardly wider than a token's numbers learns late.  Source: Karras et al., Elucidating the Design Space
+ * of Diffusion-Based Generative Models, 2022, appendix B.6, for this interpolant. */
+dar_val *dar_dit_velocity(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, dar_val *y, dar_val *z,
+                          const dar_dit_time *time);
+
 /* A block by itself: x [B, L, D], as it is (no segment). */
 dar_val *dar_dit_block_forward(dar_tape *t, const dar_dit *m, int block, const dar_dit_scene *s, const dar_dit_text *x,
                                dar_val *e0, dar_val *tokens);

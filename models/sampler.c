@@ -215,8 +215,9 @@ static void write_times(const dar_sampler *s, struct run *r, double time)
 /* What comes before a prompt: on the tape of the step. */
 struct begun {
     dar_dit_scene scene;
+    dar_dit_time time;
     dar_dit_moment e;
-    dar_val *tokens;
+    dar_val *z, *tokens;
 };
 
 static void begin(dar_sampler *s, const struct run *r, int64_t i, struct begun *b)
@@ -228,8 +229,10 @@ static void begin(dar_sampler *s, const struct run *r, int64_t i, struct begun *
         prepare_scene(s, t, w->clip, i, &b->scene);
         b->scene.held = w->scene.held;
     }
-    b->e = dar_dit_time_embed(t, s->m, 1, &(dar_dit_time){ r->times, r->rows });
-    b->tokens = dar_dit_embed(t, s->m, &b->scene, dar_leaf(t, r->z, NULL));
+    b->time = (dar_dit_time){ r->times, r->rows };
+    b->z = dar_leaf(t, r->z, NULL);
+    b->e = dar_dit_time_embed(t, s->m, 1, &b->time);
+    b->tokens = dar_dit_embed(t, s->m, &b->scene, b->z);
     dar_dit_blocks_begin(t, s->m, &b->scene, &b->e, b->tokens);
 }
 
@@ -242,6 +245,7 @@ static void finish(dar_sampler *s, const struct begun *b, int prompt, bool keep,
     if (!skips(s, DAR_SKIP_TEXT)) dar_dit_text_prepare(t, s->m, &s->clip.text[prompt], NULL, &text);
     dar_val *x = keep ? dar_contiguous(t, b->tokens) : b->tokens;
     dar_val *y = dar_dit_head(t, s->m, &b->scene, &b->e, dar_dit_blocks_end(t, s->m, &b->scene, &text, &b->e, x));
+    y = dar_dit_velocity(t, s->m, &b->scene, y, b->z, &b->time);
     if (!plans(s)) {
         int64_t n = y->x.shape.d[2], held = v->shape.d[2] - n;
         dar_tensor first = dar_tensor_narrow(v, 2, 0, 1), to = dar_tensor_narrow(v, 2, held, n);

@@ -81,6 +81,7 @@ static void wrong_ones_are_told(void **state)
         { "{ \"name\": \"x\", \"dit\": { " SIZES ", \"frequencies\": 7 } }", "even" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES ", \"eps\": 0 } }", "dit.eps" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES ", \"rope_base\": 0.5 } }", "dit.rope_base" },
+        { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"adapter\": { \"spread\": 0 } }", "adapter.spread" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"adapter\": { \"widen\": \"zero\" } }", "copy, fresh" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"adapter\": { \"blocks\": 9 } }", "adapter.blocks" },
         { "{ \"name\": \"x\", \"dit\": { " SIZES " }, \"lora\": { \"targets\": [ \"q\" ] } }", "self_attn.q" },

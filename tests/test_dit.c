@@ -187,9 +187,10 @@ static dar_val *probe_loss(dar_tape *t, void *arg, dar_val *const *in)
 }
 
 /* Every trainable tensor along random directions, through the segments. */
-static void check_gradient(unsigned roles, const char *what)
+static void check_gradient(unsigned roles, bool precondition, const char *what)
 {
     dar_config c = model_preset("dar-test");
+    c.dit.precondition = precondition;
     model o;
     struct probe p = { .o = &o };
     dar_tensor x[200];
@@ -224,9 +225,46 @@ static void gradient_is_right(void **state)
     int before = dar_threads();
     (void)state;
     dar_threads_set(1); /* waking threads would cost more than the work */
-    check_gradient(DAR_PARAM_LORA | DAR_PARAM_ADAPTER, "LoRA and adapter");
-    check_gradient(DAR_PARAM_BASE | DAR_PARAM_ADAPTER, "all weights");
+    check_gradient(DAR_PARAM_LORA | DAR_PARAM_ADAPTER, false, "LoRA and adapter");
+    check_gradient(DAR_PARAM_BASE | DAR_PARAM_ADAPTER, false, "all weights");
+    check_gradient(DAR_PARAM_LORA | DAR_PARAM_ADAPTER, true, "LoRA and adapter, preconditioned");
     dar_threads_set(before);
+}
+
+/* ---------------------------------------------------------------- preconditioning */
+
+#define AT(x, i) (((const double *)(x)->data)[i])
+
+/* The formula of dar_dit_velocity, each frame at its own time, with and without the first. */
+static void guess_is_added(void **state)
+{
+    (void)state;
+    dar_config c = model_preset("dar-test");
+    model o;
+    model_init(&o, &c, DAR_F64, false);
+    dar_params_fresh(&o.p, DAR_PARAM_ALL, 5);
+    dar_rng_fill_uniform(&o.m.head_w->x, 9, 0, -1, 1);
+    model_clip(&o, 3, 1, 2, 4);
+    dar_tensor plain = dar_tensor_push(&o.weights, DAR_F64, o.z.shape);
+    dar_tensor_copy(&plain, &model_velocity(&o)->x);
+    o.m.c.precondition = true;
+    dar_tensor whole = dar_tensor_push(&o.weights, DAR_F64, o.z.shape);
+    dar_tensor_copy(&whole, &model_velocity(&o)->x);
+    dar_tape *t = &o.tape;
+    dar_dit_scene s = { .latent = o.z.shape };
+    dar_tensor rest = dar_tensor_narrow(&plain, 2, 1, 2);
+    dar_val *held = dar_dit_velocity(t, &o.m, &s, dar_leaf(t, rest, NULL), dar_leaf(t, o.z, NULL),
+                                     &(dar_dit_time){ model_times, 2 });
+    size_t C = (size_t)o.z.shape.d[1], n = (size_t)(o.z.shape.d[3] * o.z.shape.d[4]);
+    for (size_t i = 0; i < 2 * C * 3 * n; i++) {
+        size_t b = i / (C * 3 * n), f = i / n % 3;
+        double sigma = model_times[2 * b + (f > 0)] / 1000, square = sigma * sigma + (1 - sigma) * (1 - sigma);
+        double want = (2 * sigma - 1) / square * AT(&o.z, i) + AT(&plain, i) / sqrt(square);
+        CHECK_NEAR("velocity", AT(&whole, i), want, 1e-13);
+        if (!f) continue;
+        CHECK_NEAR("without the first", AT(&held->x, (i / n / 3 * 2 + f - 1) * n + i % n), want, 1e-13);
+    }
+    model_free(&o);
 }
 
 int main(void)
@@ -234,6 +272,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(matches_the_reference),
         cmocka_unit_test(gradient_is_right),
+        cmocka_unit_test(guess_is_added),
     };
     return cmocka_run_group_tests(tests, NULL, NULL) != 0;
 }
