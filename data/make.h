@@ -28,8 +28,8 @@
 #define DAR_MAKE_PAINTS    128
 #define DAR_MAKE_SKINS     32
 #define DAR_MAKE_MOVERS    2048
-#define DAR_MAKE_TARGETS   8 /* of one mesh */
-#define DAR_MAKE_COARSE    0.4
+#define DAR_MAKE_TARGETS   8   /* of one mesh */
+#define DAR_MAKE_COARSE    0.4 /* of the repeats of a texture, in coarse scenes */
 #define DAR_MAKE_SIDE      128 /* of a texture [px] */
 
 /* One property of one node over time, in addition to its rest value:

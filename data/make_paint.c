@@ -9,8 +9,8 @@
 #define GRAIN 32 /* cells of fine noise across a texture */
 #define TABLE 1024
 
-#define FINE                                                                                                           \
-    (1u << DAR_PATTERN_BRICKS | 1u << DAR_PATTERN_TILES | 1u << DAR_PATTERN_WOOD) /* patterns with thin lines */
+/* Patterns with thin lines. */
+#define THIN (1u << DAR_PATTERN_BRICKS | 1u << DAR_PATTERN_TILES | 1u << DAR_PATTERN_WOOD)
 
 /* sRGB: two that fill, one that accents, one that is dark or light. */
 static const uint32_t palettes[][4] = {
@@ -156,7 +156,7 @@ static void paint_row(void *ctx, size_t row, int thread)
 static dar_pattern draw_pattern(dar_dice *d, unsigned wanted, bool coarse)
 {
     unsigned all = (1u << DAR_PATTERNS) - 1, any = wanted ? wanted & all : all;
-    if (coarse) any = any & ~FINE ? any & ~FINE : all & ~FINE;
+    if (coarse) any = any & ~THIN ? any & ~THIN : all & ~THIN;
     for (;;) {
         size_t i = dar_dice_below(d, DAR_PATTERNS);
         if (any >> i & 1) return (dar_pattern)i;

@@ -16,8 +16,7 @@
  *   dit.text_keys      0 ..            512      keys that cross-attention sees: shorter texts are filled up with zeros
  *   dit.rope_base      > 1             10000    the frequencies of the positions fall from 1 towards 1 / rope_base
  *   dit.eps            > 0             1e-6     of every norm
- *   dit.precondition   true | false    false    what the network adds to the best linear guess of the velocity, else
- * the velocity itself (dar_dit_velocity)
+ *   dit.precondition   true | false    false    its result is added to a guess of the velocity (dar_dit_velocity)
  *
  *   adapter.rays       0 ..            24       packed ray channels; 0 with no geometry: there is no adapter
  *   adapter.geometry   0 ..            0        N: geometry channels after them

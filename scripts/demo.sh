@@ -10,7 +10,7 @@ MESH=${MESH:-} REFERENCE=${REFERENCE:-}
 NAME=$(basename "${MESH%.*}")
 OUT=${OUT:-out/demo}${MESH:+-$NAME}
 SIZE=${SIZE:-224x128}
-SET=${SET:---coarse}                     # other options of dar-bundle synth, as in pretrain.sh
+SET=${SET---coarse}                     # other options of dar-bundle synth, as in pretrain.sh
 FRAMES=${FRAMES:-17}
 SAMPLE=${SAMPLE:---steps 20}             # options of dar-sample
 STEPS=${STEPS:-100}                      # of each training: some 5 minutes in all on two cores

@@ -12,7 +12,7 @@ OUT=${OUT:-out/pretrain}
 MODEL=${MODEL:-models/dar-tiny}
 CLIPS=${CLIPS:-1200}    # to learn from
 HELD=${HELD:-68}        # to look at
-SET=${SET:---coarse}    # options of dar-bundle synth
+SET=${SET---coarse}    # options of dar-bundle synth
 KEYS=${KEYS:-}
 
 say() {

@@ -41,7 +41,7 @@ paper)
     ;;
 *)
     [ "$SCALE" = smoke ] && DATA=${DATA:-$OUT/data}
-    CONFIGS=${CONFIGS:-$PWD/train/configs/dar-tiny} DATA=${DATA:-out/data} SET=${SET:---coarse}
+    CONFIGS=${CONFIGS:-$PWD/train/configs/dar-tiny} DATA=${DATA:-out/data} SET=${SET---coarse}
     backbone=$MODEL/backbone weights=null codec= warmup=$((STEPS / 20))
     ;;
 esac

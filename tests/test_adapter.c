@@ -64,6 +64,27 @@ static void product_is_unshuffle_and_convolution(void **state)
     model_free(&o);
 }
 
+/* Fresh weights of the convolution, and they alone, are larger by the configured factor. */
+static void spread_scales(void **state)
+{
+    (void)state;
+    dar_config c = model_preset("dar-test");
+    model one, eight;
+    model_init(&one, &c, DAR_F64, false);
+    c.adapter.spread = 8;
+    model_init(&eight, &c, DAR_F64, false);
+    dar_params_fresh(&one.p, DAR_PARAM_ADAPTER, 1);
+    dar_params_fresh(&eight.p, DAR_PARAM_ADAPTER, 1);
+    for (int64_t i = 0; i < 100; i++) {
+        double w = at(&one.m.adapter.w->x, i);
+        CHECK(w != 0, "weight %d is 0", (int)i);
+        CHECK_NEAR("weight", at(&eight.m.adapter.w->x, i), 8 * w, 1e-13);
+    }
+    CHECK_NEAR("bias", at(&eight.m.adapter.b->x, 0), at(&one.m.adapter.b->x, 0), 0);
+    model_free(&one);
+    model_free(&eight);
+}
+
 static void pixels_must_fit(void **state)
 {
     (void)state;
@@ -264,6 +285,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(product_is_unshuffle_and_convolution),
+        cmocka_unit_test(spread_scales),
         cmocka_unit_test(pixels_must_fit),
         cmocka_unit_test(groups_change_nothing),
         cmocka_unit_test(widened_by_copy_is_the_narrow_model),

@@ -187,6 +187,22 @@ static void held_in_one_block(void **state)
     drop(&b);
 }
 
+/* At sigma 1 the best guess of the velocity is z itself, so that one step ends at -y instead of z - y. */
+static void guess_is_taken_along(void **state)
+{
+    (void)state;
+    struct bench b;
+    struct walk w = { 0 };
+    init(&b, DAR_F64);
+    b.c.solver.steps = 1, b.alone = true;
+    dar_tensor plain = sample(&b, &w, NULL);
+    b.o.m.c.precondition = true, w.seen = 0;
+    dar_tensor guessed = sample(&b, &w, NULL);
+    const double *z = b.noise.data, *x = plain.data, *y = guessed.data;
+    for (size_t i = 0; i < dar_tensor_count(&plain); i++) CHECK_NEAR("end", y[i], x[i] - z[i], 1e-12);
+    drop(&b);
+}
+
 /* ---------------------------------------------------------------- windows */
 
 /* Every frame is seen; neighbours share what was asked for or more; all are of one length. */
@@ -541,6 +557,7 @@ int main(void)
         cmocka_unit_test(five_steps),
         cmocka_unit_test(skips_change_nothing),
         cmocka_unit_test(held_in_one_block),
+        cmocka_unit_test(guess_is_taken_along),
         cmocka_unit_test(windows_cover),
         cmocka_unit_test(one_window),
         cmocka_unit_test(several_windows),
