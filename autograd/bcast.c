@@ -127,7 +127,8 @@ void dar_bcast_map(const dar_bcast *b)
 
 void dar_bcast_opposites(dar_bcast b, double *slope, const dar_tensor gx[2], const bool add[2])
 {
-    for (int i = 0; i < 2; i++, *slope = -*slope) {
+    for (int i = 1; i >= 0; i--) { /* x[0] last: its gradient may lie there */
+        *slope = -*slope;
         if (!gx[i].data) continue;
         b.y = &gx[i];
         b.add = add[i];

@@ -13,7 +13,8 @@
 
 #define DAR_BCAST_IN 3 /* most inputs */
 
-/* y = fn(x[0], x[1], ...) on n elements of k's type; y is none of the others. */
+/* y = fn(x[0], x[1], ...) on n elements of k's type; y is none of the others, but where the
+ * caller of what calls fn says so. */
 typedef void dar_bcast_fn(const dar_kern *k, const void *arg, size_t n, const void *const *x, void *y);
 
 typedef struct dar_bcast {

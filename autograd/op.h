@@ -9,14 +9,15 @@
  *
  *   backward  For each i with gx[i].data: gx[i] = (add[i] ? gx[i] : 0) + J_i^T gy.  Reads aux, gy, and of the x[i]
  *             and y only those named in `keep`.  The gx[i] never overlap; gx[0] is gy itself where the op is
- *             `in_place` and nobody else needs gy.
+ *             `in_place` and nobody else needs gy, or x[0] itself where it is `over` and nobody else needs x[0].
  *
  *   both      Allocate nothing and keep no state; scratch comes with the context, of the size that `scratch` asked
  *             for.  Every tensor is contiguous.  The same bits for any number of threads.
  *
  *   types     Storage differs from input to input as it likes, but an input that gets a gradient is f64 only if x[0]
  *             is.  Arithmetic is f64 if y or x[0] is f64, else f32 or wider; aux is of that type.  A gradient is f64
- *             if its value is, else f32. */
+ *             if its value is, else f32; or bf16 with its value, where both ops that meet there say so (`half`) and
+ *             nothing is added to it. */
 #ifndef DAR_AUTOGRAD_OP_H
 #define DAR_AUTOGRAD_OP_H
 
@@ -64,7 +65,9 @@ typedef struct dar_op {
     bool variadic;
     bool strided;     /* forward takes strided views as they are */
     bool in_place;    /* gx[0] may lie where gy lies, if x[0] has y's shape: then add[0] is false */
+    bool over;        /* gx[0] may lie where x[0] lies: then add[0] is false */
     unsigned keep;    /* what backward reads */
+    unsigned half;    /* DAR_KEEP_X bits of inputs whose gradient may be bf16, DAR_KEEP_Y: gy may be */
     unsigned frozen;  /* DAR_KEEP_X bits of inputs that never get a gradient (positions, masks) */
     size_t attr_size; /* bytes copied onto the tape */
 

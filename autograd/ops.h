@@ -1,8 +1,9 @@
 /* ops.h: every op, as the networks call it.
  *
- * x has any storage type unless said; y has x's storage type unless said.  Gradients are f32, or f64 where x is f64.
- * Letters as in the whole project: B batch, T frames, H W height and width, C channels, N tokens, D width of the model,
- * A heads, E head size, F feed-forward width.  Shapes that do not fit abort with the op's name. */
+ * x has any storage type unless said; y has x's storage type unless said.  Gradients are f32, or f64 where x is f64; of
+ * values between two ops that allow it, stored as bf16 and read once, bf16 (autograd/op.h). Letters as in the whole
+ * project: B batch, T frames, H W height and width, C channels, N tokens, D width of the model, A heads, E head size, F
+ * feed-forward width.  Shapes that do not fit abort with the op's name. */
 #ifndef DAR_AUTOGRAD_OPS_H
 #define DAR_AUTOGRAD_OPS_H
 

@@ -24,9 +24,9 @@ void *dar_spare_take(dar_spare *s, dar_arena *a, size_t bytes)
     for (int i = 0; i < s->count; i++) {
         const dar_spare_block *b = &s->block[i];
         if (b->bytes >= bytes && b->bytes / LARGE <= bytes && (best < 0 || b->bytes < s->block[best].bytes)) best = i;
-        if (!b->apart && b->at + b->bytes == a->base + a->used && b->bytes < bytes) end = i;
+        if (a && !b->apart && b->at + b->bytes == a->base + a->used && b->bytes < bytes) end = i;
     }
-    if (best < 0 && end < 0) return dar_arena_push(a, bytes);
+    if (best < 0 && end < 0) return a ? dar_arena_push(a, bytes) : NULL;
     dar_spare_block *b = &s->block[best < 0 ? end : best];
     void *p = b->at;
     if (best < 0) { /* the last block, and some more behind it */

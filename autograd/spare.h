@@ -21,7 +21,8 @@ typedef struct dar_spare {
     int count;
 } dar_spare;
 
-/* `bytes` out of the smallest block that has them (a small piece is not cut out of a large one), else from a's end. */
+/* `bytes` out of the smallest block that has them (a small piece is not cut out of a large one), else from a's end; a
+ * NULL: else NULL. */
 void *dar_spare_take(dar_spare *s, dar_arena *a, size_t bytes);
 
 /* What dar_spare_take or dar_arena_push gave is free again. */

@@ -28,6 +28,7 @@ struct dar_node {
     const void *attr;
     dar_tensor aux;
     bool own_aux; /* it is the tape's memory */
+    bool over;    /* nothing that backward comes to later reads the value of input 0 */
     dar_segment_fn *fn;
     dar_rows_attr rows; /* of a segment in pieces: fn is NULL */
     void *arg;
@@ -60,9 +61,11 @@ void dar_tape_clear(dar_tape *t)
     *t = fresh;
 }
 
-dar_tape_place dar_tape_mark(const dar_tape *t)
+dar_tape_place dar_tape_mark(dar_tape *t)
 {
-    return (dar_tape_place){ dar_arena_mark(t->arena), dar_arena_mark(&t->meta) };
+    dar_tape_place p = { dar_arena_mark(t->arena), dar_arena_mark(&t->meta), t->spare, t->inside };
+    t->inside = true;
+    return p;
 }
 
 void dar_tape_reset(dar_tape *t, dar_tape_place p)
@@ -70,6 +73,8 @@ void dar_tape_reset(dar_tape *t, dar_tape_place p)
     DAR_ASSERT((unsigned char *)t->last < t->meta.base + p.meta, "tape: a reset of what is recorded");
     dar_arena_reset(t->arena, p.arena);
     dar_arena_reset(&t->meta, p.meta);
+    t->spare = p.spare;
+    t->inside = p.inside;
 }
 
 void *dar_tape_room(dar_tape *t, size_t bytes)
@@ -157,10 +162,13 @@ static void run(dar_tape *t, const dar_op *op, dar_opctx *c, bool backward)
 {
     dar_mark m = dar_arena_mark(t->arena);
     c->threads = dar_threads();
-    if (op->scratch) c->scratch = dar_arena_push(t->arena, op->scratch(c, backward));
+    size_t scratch = op->scratch ? op->scratch(c, backward) : 0;
+    void *spare = scratch ? dar_spare_take(&t->spare, NULL, scratch) : NULL;
+    c->scratch = spare ? spare : dar_arena_push(t->arena, scratch);
     if (op->flops) *(backward ? &t->cost.backward : &t->cost.forward) += op->flops(c, backward);
     t->cost.ops++;
     if (!t->arena->plan) (backward ? op->backward : op->forward)(c);
+    if (spare) give(t, spare, scratch);
     dar_arena_reset(t->arena, m);
 }
 
@@ -246,6 +254,14 @@ static void compute(dar_tape *t, const dar_op *op, dar_opctx *c, int n, bool wit
     look(t, op->name, &c->y, false);
 }
 
+/* A call will give v a gradient, recorded now or in the replay of a segment: where segments begin and end changes no
+ * type. */
+static void gives_grad(dar_val *v, bool half)
+{
+    v->half &= half && !v->given;
+    v->given = true;
+}
+
 static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val *const *in, int n, dar_val *y,
                       bool own_aux)
 {
@@ -253,8 +269,11 @@ static void push_node(dar_tape *t, const dar_op *op, const dar_opctx *c, dar_val
     void *attr = op->attr_size ? dar_tape_store(t, c->attr, op->attr_size) : NULL;
     *node = (dar_node){ .prev = t->last, .n = n, .y = y, .op = op, .attr = attr, .aux = c->aux, .own_aux = own_aux };
     memcpy(node->in, in, (size_t)n * sizeof *in);
-    for (int i = 0; i < n; i++)
+    node->over = op->over && !in[0]->read;
+    for (int i = 0; i < n; i++) {
         if (in[i] && op->keep & DAR_KEEP_X(i)) in[i]->read = true;
+        if (i && in[i] == in[0]) node->over = false;
+    }
     y->read = op->keep & DAR_KEEP_Y;
     t->last = node;
 }
@@ -269,7 +288,9 @@ static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n
     for (int i = 0; i < n; i++) {
         in[i] = given[i];
         if (in[i] && !op->strided && !dar_tensor_contiguous(&in[i]->x)) in[i] = dar_contiguous(t, in[i]);
-        wants |= grad_goes_to(op, in[i], i);
+        if (!grad_goes_to(op, in[i], i)) continue;
+        gives_grad(in[i], op->half & DAR_KEEP_X(i));
+        wants = true;
     }
     t->touched |= wants;
     wants &= t->recording;
@@ -279,6 +300,7 @@ static dar_val *call(dar_tape *t, const dar_op *op, dar_val *const *given, int n
     compute(t, op, &c, n, lost(t, in, n), &how);
     dar_val *y = push_val(t, c.y);
     y->wants_grad = wants;
+    y->half = op->half & DAR_KEEP_Y;
     y->own = y->x.data && !op->view && !how.ready && how.y == t->arena;
     if (op->view) in[0]->read = true;
     if (wants) push_node(t, op, &c, in, n, y, c.aux.data && !how.ready && how.aux == t->arena);
@@ -293,9 +315,14 @@ dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, con
 
 /* ---------------------------------------------------------------- backward */
 
+static dar_dtype grad_type(const dar_val *v)
+{
+    return v->half && v->x.dtype == DAR_BF16 ? DAR_BF16 : dar_compute_type(v->x.dtype);
+}
+
 static void ensure_grad(dar_tape *t, dar_val *v)
 {
-    if (!v->g.data) v->g = take(t, dar_compute_type(v->x.dtype), v->x.shape);
+    if (!v->g.data) v->g = take(t, grad_type(v), v->x.shape);
 }
 
 static void release_grad(dar_tape *t, dar_val *v)
@@ -336,10 +363,20 @@ static bool taken(const dar_opctx *c, int i, const dar_val *v)
 static void hand_on(const dar_op *op, dar_val *x, dar_val *y)
 {
     if (!op->in_place || !grad_goes_to(op, x, 0) || x->g.data || y->leaf) return;
-    if (!dar_shape_equal(&x->x.shape, &y->x.shape) || dar_compute_type(x->x.dtype) != y->g.dtype) return;
+    if (!dar_shape_equal(&x->x.shape, &y->x.shape) || grad_type(x) != y->g.dtype) return;
     x->g = y->g;
     x->lent = y->lent;
     y->g.data = NULL;
+}
+
+/* Where an op works over x[0] and nobody else reads that, its memory becomes the gradient's. */
+static void lay_over(const dar_node *node)
+{
+    dar_val *x = node->in[0];
+    if (!node->over || !grad_goes_to(node->op, x, 0) || x->g.data || !x->own) return;
+    if (grad_type(x) != x->x.dtype || !dar_tensor_contiguous(&x->x)) return;
+    x->g = x->x;
+    x->own = false;
 }
 
 static void op_backward(dar_tape *t, const dar_node *node)
@@ -350,6 +387,7 @@ static void op_backward(dar_tape *t, const dar_node *node)
 
     fill_inputs(&c, node->in, node->n);
     hand_on(op, node->in[0], node->y);
+    lay_over(node);
     for (int i = 0; i < node->n; i++)
         if (grad_goes_to(op, node->in[i], i)) ensure_grad(t, node->in[i]);
     dar_mark m = dar_arena_mark(t->arena);
@@ -423,7 +461,7 @@ static bool passes(const dar_node *node)
     if (!x || !x->wants_grad || x->g.data || !(node->fn || is_cut(node, 0))) return false;
     for (int i = 1; i < node->n; i++)
         if (node->in[i] == x) return false;
-    return dar_shape_equal(&x->x.shape, &y->x.shape) && dar_compute_type(x->x.dtype) == y->g.dtype;
+    return dar_shape_equal(&x->x.shape, &y->x.shape) && grad_type(x) == y->g.dtype;
 }
 
 /* Stand-ins for the segment's inputs, or for a piece of them, sharing value and gradient; the same value stays one
@@ -437,7 +475,7 @@ static void stand_in(dar_tape *t, const dar_node *node, const struct found *f, c
         in[i] = dar_tape_room(t, sizeof *in[i]);
         *in[i] = *node->in[i];
         in[i]->leaf = true; /* its memory is not the segment's to free */
-        in[i]->own = false;
+        in[i]->own = in[i]->given = false;
         if (!is_cut(node, i)) continue;
         in[i]->x = dar_rows_view(&in[i]->x, *rows);
         if (in[i]->g.data) in[i]->g = dar_rows_view(&in[i]->g, *rows);
@@ -445,9 +483,13 @@ static void stand_in(dar_tape *t, const dar_node *node, const struct found *f, c
     }
 }
 
+/* The result is made inside, so that it has a gradient of its own. */
 static dar_val *run_piece(dar_tape *t, const dar_node *node, dar_val *const *in, const dar_rows *rows)
 {
-    return node->fn ? node->fn(t, node->arg, in) : node->rows.fn(t, node->arg, in, *rows);
+    dar_val *y = node->fn ? node->fn(t, node->arg, in) : node->rows.fn(t, node->arg, in, *rows);
+    bool inside = !y->leaf;
+    for (int i = 0; i < node->n; i++) inside &= y != in[i];
+    return inside ? y : dar_contiguous(t, y);
 }
 
 static void piece_backward(dar_tape *t, const dar_node *node, const struct found *f, int64_t i)
@@ -465,7 +507,6 @@ static void piece_backward(dar_tape *t, const dar_node *node, const struct found
     t->replaying = true;
     stand_in(t, node, f, &rows, in);
     dar_val *y = run_piece(t, node, in, &rows);
-    if (y->leaf) y = dar_contiguous(t, y); /* so that it has a gradient of its own */
     y->g = g;
     y->lent = f->pass || !node->fn; /* a part of it is not free before the rest is */
     y->has_grad = true;
@@ -532,6 +573,7 @@ void dar_backward(dar_tape *t, dar_val *y, const dar_tensor *seed)
 {
     DAR_ASSERT(y->wants_grad && !y->leaf, "backward: nothing that led here wants a gradient");
     DAR_ASSERT(seed || dar_tensor_count(&y->x) == 1, "backward: %zu elements need a seed", dar_tensor_count(&y->x));
+    y->half = false;
     ensure_grad(t, y);
     if (!t->arena->plan) {
         if (seed) dar_tensor_copy(&y->g, seed);
@@ -586,7 +628,7 @@ static void piece_forward(dar_tape *t, const dar_node *node, int64_t i)
                dar_shape_text(&r->x.shape, a, sizeof a), dar_dtype_name(y.dtype),
                dar_shape_text(&y.shape, b, sizeof b));
     if (!t->arena->plan) dar_tensor_copy(&y, &r->x);
-    t->touched |= r->wants_grad; /* an input or a leaf, handed through */
+    node->y->half = node->fn && r->half;
     node->y->wants_grad |= p.was.recording && t->touched;
     if (t->kept && t->touched) p.keep = dar_arena_mark(t->keep); /* the replay needs what was kept */
     leave(t, &p);
@@ -603,7 +645,9 @@ static dar_val *segment(dar_tape *t, const dar_node *like, dar_val *const *in, b
     for (int i = 0; i < node->n; i++) {
         check_origin(t, in[i]);
         node->in[i] = in[i];
-        if (in[i]) in[i]->read = true;
+        if (!in[i]) continue;
+        in[i]->read = true;
+        in[i]->half &= node->fn != NULL; /* pieces add to it */
     }
     unread &= t->replaying;
     node->y = push_val(t, unread ? dar_tensor_of(a->type, a->shape, NULL) : take(t, a->type, a->shape));

@@ -20,13 +20,15 @@
  * then x.data is NULL, but for leaves and the value that backward began with. */
 typedef struct dar_val {
     dar_tensor x; /* the value */
-    dar_tensor g; /* its gradient, in the arithmetic type; data NULL until backward reaches it */
+    dar_tensor g; /* its gradient, in the arithmetic type or bf16; data NULL until backward reaches it */
     bool wants_grad;
     bool has_grad; /* g holds something to add to */
     bool leaf;     /* g is the owner's memory: kept, and added to from step to step */
     bool own;      /* x is the tape's memory and this value's alone */
     bool lent;     /* g is memory that somebody else gives back */
     bool read;     /* backward, or a view, reads x */
+    bool given;    /* some call gives it a gradient */
+    bool half;     /* its gradient is bf16 if it is: who made it takes such a one, and the only one to give it does */
 } dar_val;
 
 typedef struct dar_node dar_node;
@@ -56,7 +58,8 @@ typedef struct dar_tape {
     dar_spare spare;          /* values and gradients that nobody reads any more */
     const void *oldest;       /* first value of the segment being replayed */
     struct dar_keeping *kept; /* of the segment being run or replayed */
-    bool inside, replaying;   /* a segment */
+    bool inside;              /* a segment, or a place to come back to */
+    bool replaying;           /* a segment */
     bool touched;             /* an input of an op since the segment began wants a gradient */
 } dar_tape;
 
@@ -69,11 +72,14 @@ void dar_tape_free(dar_tape *t);
 /* Forget nodes and values, spare memory, cost and bad_op.  The arenas `arena` and `keep` are the caller's to reset. */
 void dar_tape_clear(dar_tape *t);
 
-/* Where a tape stands, and back there: everything made since is gone.  Nothing of it may be recorded. */
+/* Where a tape stands, and back there: everything made since is gone.  Nothing of it may be recorded.  In between, what
+ * is dropped gives its memory as inside a segment. */
 typedef struct dar_tape_place {
     dar_mark arena, meta;
+    dar_spare spare;
+    bool inside;
 } dar_tape_place;
-dar_tape_place dar_tape_mark(const dar_tape *t);
+dar_tape_place dar_tape_mark(dar_tape *t);
 void dar_tape_reset(dar_tape *t, dar_tape_place p);
 
 /* A value over memory of the caller, pushed on the arena.  g: gradient memory of the arithmetic type and x's shape that
@@ -91,7 +97,8 @@ void *dar_tape_room(dar_tape *t, size_t bytes); /* the same, zeroed */
  * first. */
 dar_val *dar_apply(dar_tape *t, const dar_op *op, dar_val *const *in, int n, const void *attr);
 
-/* Say that v is not used any more: inside a segment its memory is free for others, unless backward will read it. */
+/* Say that v is not used any more: inside a segment, or after dar_tape_mark, its memory is free for others, unless
+ * backward will read it. */
 void dar_drop(dar_tape *t, dar_val *v);
 
 /* Gradients of the scalar (or, with seed, of <seed, y>) with respect to every leaf that wants one.  Clears the tape's

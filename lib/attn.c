@@ -439,7 +439,8 @@ static void load_queries(const struct job *j, const struct backward_scratch *f, 
         double sum = dar_dtype_get(j->real, a->stats.data, at + 1);
         const void *y = dar_row_get(j->real, a->y.dtype, row_at(&a->y, row + i, col), j->E, f->row);
         char *gy = f->gy + i * j->E * j->real_size;
-        j->rows->scale(j->E, sum == 0 ? 0 : 1 / sum, row_at(&a->gy, row + i, col), gy);
+        const void *g = dar_row_get(j->real, a->gy.dtype, row_at(&a->gy, row + i, col), j->E, gy);
+        j->rows->scale(j->E, sum == 0 ? 0 : 1 / sum, g, gy);
         dar_dtype_set(j->real, f->max, i, dar_dtype_get(j->real, a->stats.data, at));
         dar_dtype_set(j->real, f->dot, i, j->rows->dot(j->E, gy, y));
     }
@@ -485,12 +486,16 @@ static void backward_block(const struct job *j, const struct backward_scratch *f
         product(out, n, j->E, m, ds_t, f->k_cols + block * bytes_b(out, j->E, ROWS_BACK), f->dq, j->E, k0 > 0);
 }
 
-/* gx[row + i, col ...] = (add ? that : 0) + scale x[i] for n rows of one head. */
-static void store(const struct job *j, const dar_tensor *gx, size_t row, size_t col, size_t n, double scale,
-                  const char *x, bool add)
+/* gx[row + i, col ...] = (add ? that : 0) + scale x[i] for n rows of one head; x is overwritten if gx is bf16. */
+static void store(const struct job *j, const dar_tensor *gx, size_t row, size_t col, size_t n, double scale, char *x,
+                  bool add)
 {
-    for (size_t i = 0; i < n; i++)
-        (add ? j->rows->axpy : j->rows->scale)(j->E, scale, x + i * j->E * j->real_size, row_at(gx, row + i, col));
+    bool half = gx->dtype != j->real;
+    for (size_t i = 0; i < n; i++, x += j->E * j->real_size) {
+        char *to = row_at(gx, row + i, col);
+        (add && !half ? j->rows->axpy : j->rows->scale)(j->E, scale, x, half ? x : to);
+        if (half) dar_row_put(j->real, x, gx->dtype, to, j->E, add ? DAR_PUT_ADD : DAR_PUT);
+    }
 }
 
 static void backward_task(void *ctx, size_t task, int thread)

@@ -58,7 +58,9 @@ static dar_val *last_product(dar_tape *t, const struct block *a, dar_projection 
 {
     bool trained = gated && (a->e0->wants_grad || a->b->modulation->g.data);
     dar_keep keep = !a->cheap ? DAR_KEEP_NOTHING : trained ? DAR_KEEP_ALL : DAR_KEEP_AUX;
-    return dar_dit_multiply(t, a->m, &a->b->product[which], DAR_ACT_NONE, keep, x);
+    dar_val *y = dar_dit_multiply(t, a->m, &a->b->product[which], DAR_ACT_NONE, keep, x);
+    dar_drop(t, x);
+    return y;
 }
 
 /* gelu(x W^T + b).  The activation is part of the product but where it is computed again: its argument, in the storage
@@ -67,8 +69,12 @@ static dar_val *activated(dar_tape *t, const struct block *a, dar_val *x)
 {
     const dar_dit_product *up = &a->b->product[DAR_FFN_UP];
     dar_keep keep = a->m->replay == DAR_REPLAY_CHEAP ? DAR_KEEP_ALL : DAR_KEEP_NOTHING;
-    if (a->cheap) return dar_gelu_tanh(t, dar_dit_multiply(t, a->m, up, DAR_ACT_NONE, keep, x));
-    return dar_dit_multiply(t, a->m, up, DAR_ACT_GELU_TANH, keep, x);
+    dar_val *h = dar_dit_multiply(t, a->m, up, a->cheap ? DAR_ACT_NONE : DAR_ACT_GELU_TANH, keep, x);
+    dar_drop(t, x);
+    if (!a->cheap) return h;
+    dar_val *y = dar_gelu_tanh(t, h);
+    dar_drop(t, h);
+    return y;
 }
 
 static dar_keep keep_attention(const struct block *a)
@@ -78,7 +84,9 @@ static dar_keep keep_attention(const struct block *a)
 
 static dar_val *rms(dar_tape *t, const struct block *a, const dar_param *w, dar_val *x)
 {
-    return dar_rms_norm(t, x, dar_param_leaf(t, w), &(dar_norm_opt){ .eps = a->m->c.eps });
+    dar_val *y = dar_rms_norm(t, x, dar_param_leaf(t, w), &(dar_norm_opt){ .eps = a->m->c.eps });
+    dar_drop(t, x);
+    return y;
 }
 
 /* Rotated; nobody looks at x again. */
@@ -99,7 +107,19 @@ static dar_norm_opt norm_before(const struct block *a)
 
 static dar_val *gate(dar_tape *t, const struct block *a, dar_val *x, dar_val *u, dar_val *g)
 {
-    return dar_gate(t, x, u, g, (dar_gate_attr){ a->s->frame, a->first });
+    dar_val *y = dar_gate(t, x, u, g, (dar_gate_attr){ a->s->frame, a->first });
+    dar_drop(t, u);
+    return y;
+}
+
+/* q, k and v are not looked at again. */
+static dar_val *attention(dar_tape *t, dar_val *q, dar_val *k, dar_val *v, const dar_attention_opt *o)
+{
+    dar_val *y = dar_attention(t, q, k, v, o);
+    dar_drop(t, q);
+    dar_drop(t, k);
+    dar_drop(t, v);
+    return y;
 }
 
 /* x [B, L, D] -> [B, L, D], all three; with a->rest self-attention gives the tokens after the first frame's alone */
@@ -118,7 +138,8 @@ static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
         mod[GATE] = later(t, mod[GATE]);
     }
     dar_val *q = turned(t, rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h)), rope);
-    h = dar_attention(t, q, k, v, &o);
+    dar_drop(t, h);
+    h = attention(t, q, k, v, &o);
     return gate(t, a, x, last_product(t, a, DAR_SELF_O, h, true), mod[GATE]);
 }
 
@@ -128,7 +149,8 @@ static dar_val *cross_attention(dar_tape *t, const struct block *a, dar_val *x)
     dar_norm_opt norm = norm_before(a);
     dar_val *h = dar_layer_norm(t, x, dar_param_leaf(t, a->b->norm3_w), dar_param_leaf(t, a->b->norm3_b), &norm);
     dar_val *q = rms(t, a, a->b->norm_q[1], product(t, a, DAR_CROSS_Q, h));
-    h = dar_attention(t, q, a->k, a->v, &o);
+    dar_drop(t, h);
+    h = attention(t, q, a->k, a->v, &o);
     h = last_product(t, a, DAR_CROSS_O, h, false);
     x = dar_add(t, x, h);
     dar_drop(t, h);
@@ -248,10 +270,10 @@ typedef dar_val *part_fn(dar_tape *t, const struct block *a, dar_val *x);
 
 static void in_place(dar_tape *t, part_fn *part, const struct block *a, dar_val *from, dar_val *to)
 {
-    dar_mark m = dar_arena_mark(t->arena);
+    dar_tape_place m = dar_tape_mark(t);
     dar_val *y = part(t, a, from);
     if (!t->arena->plan) dar_tensor_copy(&to->x, &y->x);
-    dar_arena_reset(t->arena, m);
+    dar_tape_reset(t, m);
 }
 
 /* Nothing looks back: one stream, written over after every part.  begun: self-attention has been. */

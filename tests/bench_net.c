@@ -42,9 +42,16 @@ static void forward(bench *b)
     run(b, &s->plain.m);
 }
 
+static void reset(bench *b)
+{
+    bench_op_reset(b);
+    dar_arena_reset(b->tape.keep, 0);
+}
+
 static void step(bench *b)
 {
     struct state *s = b->state;
+    if (!b->tape.arena->plan) reset(b); /* what forward made is not the step's */
     b->tape.recording = true;
     dar_val *target = dar_leaf(&b->tape, s->target, NULL);
     dar_backward(&b->tape, dar_squared_error(&b->tape, run(b, &s->trained.m), target, NULL, true), NULL);
@@ -57,12 +64,6 @@ static double planned(bench *b, void (*fn)(bench *b))
     dar_tape_clear(&b->tape);
     dar_arena_reset(b->tape.arena, 0);
     return flops;
-}
-
-static void reset(bench *b)
-{
-    bench_op_reset(b);
-    dar_arena_reset(b->tape.keep, 0);
 }
 
 /* share: whose weights it has; NULL: its own. */

@@ -47,6 +47,7 @@ struct options {
     bool wide;                     /* and then the run is in f64 */
     unsigned frozen;               /* bits of inputs to leave without gradient */
     bool add;                      /* gradients on top of existing content */
+    unsigned half;                 /* gradients that are bf16 where the op allows it; any: gy is in value */
     bool inference;                /* no aux, no backward */
     double jitter;                 /* move inputs and gy by this, relatively, signs from its seed */
     uint64_t jitter_seed;
@@ -134,8 +135,11 @@ static dar_tensor make_input(const struct trial *t, const struct options *o, int
 
 static void fill_random(const dar_tensor *x, uint64_t seed, const struct options *o)
 {
-    for (size_t j = 0; j < dar_tensor_count(x); j++)
-        dar_dtype_set(x->dtype, x->data, j, jittered(o, DAR_OP_IN, j, (float)dar_gradcheck_random(seed, j)));
+    for (size_t j = 0; j < dar_tensor_count(x); j++) {
+        double v = dar_gradcheck_random(seed, j);
+        v = o->half ? round(v * 128) / 128 : (float)v; /* 8 bits at most */
+        dar_dtype_set(x->dtype, x->data, j, jittered(o, DAR_OP_IN, j, v));
+    }
 }
 
 /* What a gradient is added to. */
@@ -149,12 +153,31 @@ static bool has_gradient(const struct trial *t, const struct options *o, int i)
     return t->op->backward && i < t->n && t->x[i].data && !((t->op->frozen | o->frozen) & DAR_KEEP_X(i));
 }
 
+/* Of x[i], or of y (DAR_KEEP_Y). */
+static dar_dtype gradient_type(const struct trial *t, const struct options *o, unsigned of, dar_dtype stored)
+{
+    return o->half & t->op->half & of && stored == DAR_BF16 ? DAR_BF16 : dar_compute_type(stored);
+}
+
 static void call(const struct trial *t, dar_opctx *c, bool backward)
 {
     size_t bytes = t->op->scratch ? t->op->scratch(c, backward) : 0;
     c->scratch = t->op->scratch ? guarded(bytes) : NULL;
     (backward ? t->op->backward : t->op->forward)(c);
     check_guard(t, backward ? "backward's scratch" : "forward's scratch", c->scratch, bytes);
+}
+
+/* Once more with gx[0] where x[0] lies. */
+static void run_over(const struct trial *t, const struct options *o, dar_opctx c, const struct result *r)
+{
+    c.gx[0] = c.x[0];
+    for (int i = 0; i < t->n; i++)
+        if (i && c.gx[i].data) c.gx[i] = guarded_tensor(c.gx[i].dtype, c.gx[i].shape);
+    call(t, &c, true);
+    for (int i = 0; i < t->n; i++)
+        if (has_gradient(t, o, i))
+            CHECK(memcmp(r->gx[i].data, c.gx[i].data, dar_tensor_bytes(&c.gx[i])) == 0,
+                  "%s, sample %d: gradient %d differs with that of input 0 over its value", t->op->name, t->index, i);
 }
 
 /* Forward and backward, everything that must not be read full of NaN, canaries behind everything that is written. */
@@ -182,13 +205,13 @@ static struct result run(const struct trial *t, const struct options *o)
     r.y = copied(&c.y);
     if (!op->backward || o->inference) return r;
 
-    c.gy = dar_tensor_push(&arena, dar_compute_type(c.y.dtype), c.y.shape);
+    c.gy = dar_tensor_push(&arena, gradient_type(t, o, DAR_KEEP_Y, c.y.dtype), c.y.shape);
     fill_random(&c.gy, SEED + 100, o);
     dar_tensor gy = copied(&c.gy);
     for (int i = 0; i < t->n; i++) {
         if (c.x[i].data && !(op->keep & DAR_KEEP_X(i))) memset(c.x[i].data, POISON, dar_tensor_bytes(&c.x[i]));
         if (!has_gradient(t, o, i)) continue;
-        c.gx[i] = guarded_tensor(dar_compute_type(c.x[i].dtype), c.x[i].shape);
+        c.gx[i] = guarded_tensor(gradient_type(t, o, DAR_KEEP_X(i), c.x[i].dtype), c.x[i].shape);
         c.add[i] = o->add;
         if (o->add) fill_content(&c.gx[i], i);
     }
@@ -207,7 +230,9 @@ static struct result run(const struct trial *t, const struct options *o)
         call(t, &c, true);
         CHECK(memcmp(r.gx[0].data, c.gy.data, dar_tensor_bytes(&gy)) == 0, "%s, sample %d: in place it differs",
               op->name, t->index);
+        memcpy(c.gy.data, gy.data, dar_tensor_bytes(&gy));
     }
+    if (op->over && !o->add && r.gx[0].data && r.gx[0].dtype == c.x[0].dtype) run_over(t, o, c, &r);
     return r;
 }
 
@@ -370,6 +395,37 @@ static void precision(const struct trial *t)
         dar_cpu_init(DAR_CPU_ALL);
         dar_arena_reset(&arena, m);
     }
+}
+
+/* Gradients stored as bf16: all that may be, at every CPU level and for any number of threads; on one side only. */
+static void half(const struct trial *t, const struct storage *s)
+{
+    static const int threads[] = { 1, 3 };
+    unsigned level[5];
+    int levels = test_levels(level);
+    dar_mark m = dar_arena_mark(&arena);
+    struct options o = { .storage = s, .half = ~0u };
+    struct arbiter a = arbitrate(t, o);
+    struct result all;
+
+    for (int k = levels - 1; k >= 0; k--) {
+        dar_cpu_init(level[k]);
+        all = run(t, &o);
+        near_result(t, s->name, "gradients in bf16", s, &all, &a);
+    }
+    for (size_t k = 0; k < DAR_COUNT(threads); k++) {
+        dar_threads_set(threads[k]);
+        struct result r = run(t, &o);
+        same_result(t, "gradients in bf16, threads", &r, &all);
+    }
+    dar_threads_set(2);
+    dar_cpu_init(DAR_CPU_ALL);
+    for (unsigned only_y = 0; only_y < 2; only_y++) {
+        o.half = only_y ? DAR_KEEP_Y : ~DAR_KEEP_Y;
+        struct result r = run(t, &o);
+        near_result(t, s->name, only_y ? "gy in bf16" : "gx in bf16", s, &r, &a);
+    }
+    dar_arena_reset(&arena, m);
 }
 
 /* What must not change a bit: threads, inference, which inputs are frozen. */
@@ -552,6 +608,8 @@ static void check_op(void **state)
             precision(&t);
             for (size_t k = 0; k < DAR_COUNT(storages); k++)
                 if (storages[k].first == storages[k].other) bits(&t, &storages[k]);
+            for (size_t k = 0; op->half && k < DAR_COUNT(storages); k++)
+                if (storages[k].other == DAR_BF16) half(&t, &storages[k]);
         }
         views(&t);
         twice(&t);

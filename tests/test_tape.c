@@ -514,6 +514,86 @@ static void segment_edges(void **state)
     }
 }
 
+/* ---------------------------------------------------------------- gradients in bf16 */
+
+#define LINKS 7
+
+static dar_val *link_of(dar_tape *t, int i, dar_val *x, dar_val *aside)
+{
+    switch (i) {
+    case 0: return dar_silu(t, x);
+    case 1: return dar_rms_norm(t, x, NULL, &(dar_norm_opt){ .eps = 1e-6 });
+    case 2: return dar_add(t, x, aside);
+    case 3: return dar_add(t, dar_silu(t, x), x);
+    case 4: return dar_gelu_tanh(t, x);
+    case 5: return dar_reshape(t, dar_reshape(t, x, DAR_SHAPE(8, 5)), DAR_SHAPE(5, 8));
+    default: return dar_silu(t, dar_gelu_tanh(t, x));
+    }
+}
+
+struct links {
+    int from, to;
+};
+
+/* in: x, and what one link alone reads */
+static dar_val *links(dar_tape *t, void *arg, dar_val *const *in)
+{
+    const struct links *l = arg;
+    dar_val *x = in[0];
+    for (int i = l->from; i < l->to; i++) x = link_of(t, i, x, in[1]);
+    return x;
+}
+
+/* arg: bits of links before which a segment ends */
+static dar_val *cut_links(dar_tape *t, void *arg, dar_val *const *in)
+{
+    dar_val *x = in[0];
+    for (int from = 0, to; from < LINKS; from = to) {
+        to = from + 1;
+        while (to < LINKS && !(*(unsigned *)arg >> to & 1)) to++;
+        struct links *l = dar_tape_store(t, &(struct links){ from, to }, sizeof *l);
+        x = dar_segment(t, links, l, (dar_val *[]){ x, in[1] }, 2, x->x.dtype, x->x.shape);
+    }
+    return x;
+}
+
+/* Which gradients are bf16 does not depend on where segments begin and end: wherever the links are cut, alone or inside
+ * one more segment, the leaves' gradients are the same bits. */
+static void half_gradients_stay(void **state)
+{
+    static double expected[MOST], found[MOST];
+    dar_tensor x[2], g[2], seed;
+    (void)state;
+    dar_arena_reset(&model.memory, 0);
+    for (uint64_t i = 0; i < 2; i++) {
+        x[i] = random_tensor(&model.memory, DAR_BF16, DAR_SHAPE(5, 8), 5 + i);
+        g[i] = dar_tensor_push(&model.memory, DAR_F32, x[i].shape);
+    }
+    seed = random_tensor(&model.memory, DAR_F32, x[0].shape, 7);
+    size_t n = dar_tensor_count(&seed);
+    for (unsigned run = 0; run < 1u << LINKS; run++) {
+        unsigned cuts = run & ~1u; /* 0: none */
+        bool nested = run & 1;
+        dar_val *in[2], *y;
+        char what[64];
+        dar_tape_clear(&tape);
+        dar_arena_reset(&arena, 0);
+        for (int i = 0; i < 2; i++) {
+            dar_tensor_fill(&g[i], 0);
+            in[i] = dar_silu(&tape, dar_leaf(&tape, x[i], &g[i]));
+        }
+        if (nested) y = dar_segment(&tape, cut_links, &cuts, in, 2, DAR_BF16, x[0].shape);
+        else if (cuts) y = cut_links(&tape, &cuts, in);
+        else y = links(&tape, &(struct links){ 0, LINKS }, in);
+        dar_backward(&tape, dar_gelu_tanh(&tape, y), &seed);
+        for (int i = 0; i < 2; i++)
+            for (size_t j = 0; j < n; j++) found[i * n + j] = dar_dtype_get(DAR_F32, g[i].data, j);
+        if (run == 0) memcpy(expected, found, 2 * n * sizeof *found);
+        snprintf(what, sizeof what, "cut %#x%s", cuts, nested ? ", nested" : "");
+        same(what, found, expected, 2 * n);
+    }
+}
+
 /* ---------------------------------------------------------------- memory that is free again */
 
 /* Blocks are disjoint, joined where they touch, and what is taken from them lies in them. */
@@ -674,9 +754,9 @@ int main(void)
         cmocka_unit_test_setup(gradients_add_up, before),       cmocka_unit_test_setup(frozen_costs_nothing, before),
         cmocka_unit_test_setup(kept_results_save_work, before), cmocka_unit_test_setup(plans_are_exact, before),
         cmocka_unit_test_setup(inference_is_the_same, before),  cmocka_unit_test_setup(steps_do_not_allocate, before),
-        cmocka_unit_test_setup(segment_edges, before),          cmocka_unit_test_setup(spare_memory, before),
-        cmocka_unit_test_setup(dropped_values, before),         cmocka_unit_test_setup(wrong_calls_abort, before),
-        cmocka_unit_test_setup(bad_numbers_are_named, before),
+        cmocka_unit_test_setup(segment_edges, before),          cmocka_unit_test_setup(half_gradients_stay, before),
+        cmocka_unit_test_setup(spare_memory, before),           cmocka_unit_test_setup(dropped_values, before),
+        cmocka_unit_test_setup(wrong_calls_abort, before),      cmocka_unit_test_setup(bad_numbers_are_named, before),
     };
     return cmocka_run_group_tests(tests, open_arenas, NULL) != 0;
 }

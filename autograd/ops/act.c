@@ -42,12 +42,13 @@ static void backward_range(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct act *a = ctx;
     const dar_tensor *x = &a->c->x[0], *gy = &a->c->gy, *gx = &a->c->gx[0];
-    double buf[DAR_PIECE];
+    double buf[DAR_PIECE], gbuf[DAR_PIECE];
     (void)thread;
     for (size_t i = begin; i < end; i += DAR_PIECE) {
         size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
+        const void *g = dar_row_get(a->type, gy->dtype, dar_tensor_at(gy, i), n, gbuf);
         void *to = dar_row_out(a->type, gx->dtype, dar_tensor_at(gx, i), a->mode, buf);
-        a->back(n, dar_row_get(a->type, x->dtype, dar_tensor_at(x, i), n, buf), dar_tensor_at(gy, i), to);
+        a->back(n, dar_row_get(a->type, x->dtype, dar_tensor_at(x, i), n, buf), g, to);
         dar_row_put(a->type, to, gx->dtype, dar_tensor_at(gx, i), n, a->mode);
     }
 }
@@ -81,6 +82,7 @@ static void backward(const dar_opctx *c, dar_kern_map_back *back)
         .name = #NAME,                                                                                                 \
         .n_in = 1,                                                                                                     \
         .in_place = true,                                                                                              \
+        .half = DAR_KEEP_X(0) | DAR_KEEP_Y,                                                                            \
         .keep = DAR_KEEP_X(0),                                                                                         \
         .shape = same_shape,                                                                                           \
         .forward = NAME##_forward,                                                                                     \

@@ -133,6 +133,7 @@ const dar_op dar_op_add = {
     .name = "add",
     .n_in = 2,
     .in_place = true,
+    .half = DAR_KEEP_X(0) | DAR_KEEP_X(1) | DAR_KEEP_Y,
     .shape = sum_shape,
     .scratch = sum_scratch,
     .terms = terms,

@@ -165,6 +165,7 @@ const dar_op dar_op_attention = {
     .n_in = 4,
     .n_optional = 1,
     .keep = DAR_KEEP_X(Q) | DAR_KEEP_X(K) | DAR_KEEP_X(V) | DAR_KEEP_X(LW) | DAR_KEEP_Y,
+    .half = DAR_KEEP_X(K) | DAR_KEEP_X(V) | DAR_KEEP_Y,
     .frozen = DAR_KEEP_X(LW),
     .attr_size = sizeof(struct attr),
     .shape = shape,

@@ -188,6 +188,7 @@ const dar_op dar_op_gate = {
     .n_in = 3,
     .in_place = true,
     .keep = DAR_KEEP_X(U) | DAR_KEEP_X(G),
+    .half = DAR_KEEP_X(X) | DAR_KEEP_X(U) | DAR_KEEP_Y,
     .attr_size = sizeof(dar_gate_attr),
     .shape = gate_shape,
     .scratch = gate_scratch,

@@ -31,7 +31,7 @@ struct parts {
     const struct attr *at;
     size_t m, n, k, r;     /* r: 0 without LoRA */
     int bias;              /* index of the bias among the inputs */
-    dar_dtype type;        /* arithmetic */
+    dar_dtype type, g;     /* arithmetic; of gp */
     dar_tile_kind kind;    /* of the products */
     char *h, *p;           /* in aux; NULL: not saved */
     char *own_h, *gp, *gh; /* in scratch */
@@ -66,6 +66,7 @@ static struct parts parts_of(const dar_opctx *c, bool backward)
     s.k = dar_tensor_cols(x);
     s.n = (size_t)w->shape.d[0];
     s.r = lora ? (size_t)c->x[A].shape.d[0] : 0;
+    s.g = s.at->o.act ? s.type : c->gy.dtype;
     s.kind = s.type == DAR_F64 ? DAR_TILE_F64 : dar_gemm_kind(x->dtype, w->dtype == DAR_I8 ? x->dtype : w->dtype);
     if (c->aux.data) {
         s.h = s.r ? c->aux.data : NULL;
@@ -174,7 +175,7 @@ static dar_gemm back(const struct parts *s, int of, size_t i, size_t m, const ch
     const dar_opctx *c = s->c;
     const dar_tensor *x = &c->x[X];
     size_t e = dar_dtype_size(s->type);
-    dar_matrix g = matrix(s->type, gp, s->n, false), gt = matrix(s->type, gp, s->n, true);
+    dar_matrix g = matrix(s->g, gp, s->n, false), gt = matrix(s->g, gp, s->n, true);
     dar_matrix rows = matrix(x->dtype, (const char *)x->data + i * s->k * dar_dtype_size(x->dtype), s->k, false);
     dar_gemm p = { .kind = s->kind, .alpha = 1, .type = s->type, .add = i || c->add[of] };
 
@@ -184,7 +185,8 @@ static dar_gemm back(const struct parts *s, int of, size_t i, size_t m, const ch
         p.m = m, p.n = s->k, p.k = s->n;
         p.a = g, p.b = matrix_of(&c->x[W], false);
         if (s->r) p.k2 = s->r, p.a2 = matrix(s->type, s->gh, s->r, false), p.b2 = matrix_of(&c->x[A], false);
-        p.c = (char *)p.c + i * s->k * e;
+        p.type = c->gx[X].dtype;
+        p.c = (char *)p.c + i * s->k * dar_dtype_size(p.type);
         p.add = c->add[X];
     } else if (of == W) {
         p.m = s->n, p.n = s->k, p.k = m;
@@ -209,7 +211,7 @@ static dar_gemm back_h(const struct parts *s, size_t m, const char *gp)
         .m = m,
         .n = s->r,
         .k = s->n,
-        .a = matrix(s->type, gp, s->n, false),
+        .a = matrix(s->g, gp, s->n, false),
         .b = matrix_of(&s->c->x[U], false),
         .alpha = s->at->scale,
         .type = s->type,
@@ -220,7 +222,7 @@ static dar_gemm back_h(const struct parts *s, size_t m, const char *gp)
 
 static dar_bcast bias_sum(const struct parts *s, dar_tensor *rows, size_t i, size_t m, char *gp)
 {
-    *rows = dar_tensor_of(s->type, DAR_SHAPE((int64_t)m, (int64_t)s->n), gp);
+    *rows = dar_tensor_of(s->g, DAR_SHAPE((int64_t)m, (int64_t)s->n), gp);
     return (dar_bcast){
         .x = { rows }, .y = &s->c->gx[s->bias], .add = i || s->c->add[s->bias], .factor = 1, .scratch = s->rest
     };
@@ -250,21 +252,25 @@ struct act_back {
 static void act_range(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct act_back *a = ctx;
-    size_t e = dar_dtype_size(a->s->type), from = a->first + begin;
+    const struct parts *s = a->s;
+    const dar_tensor *gy = &s->c->gy;
+    size_t e = dar_dtype_size(s->type);
+    double buf[DAR_PIECE];
     (void)thread;
-    dar_kern_for(a->s->type)
-        ->gelu_tanh_back(end - begin, a->s->p + from * e, (const char *)a->s->c->gy.data + from * e,
-                         a->s->gp + begin * e);
+    for (size_t i = begin, n; i < end; i += n) {
+        n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
+        const void *g = dar_row_get(s->type, gy->dtype, dar_tensor_at(gy, a->first + i), n, buf);
+        dar_kern_for(s->type)->gelu_tanh_back(n, s->p + (a->first + i) * e, g, s->gp + i * e);
+    }
 }
 
 static void backward(const dar_opctx *c)
 {
     struct parts s = parts_of(c, true);
-    size_t e = dar_dtype_size(s.type);
 
     for (size_t i = 0; i < s.m; i += piece(&s)) {
         size_t m = s.m - i < piece(&s) ? s.m - i : piece(&s);
-        char *gp = (char *)c->gy.data + i * s.n * e;
+        char *gp = dar_tensor_at(&c->gy, i * s.n);
         if (s.at->o.act) {
             struct act_back a = { &s, i * s.n };
             dar_parallel_range(m * s.n, 16 * DAR_PIECE, act_range, &a);
@@ -277,7 +283,7 @@ static void backward(const dar_opctx *c)
         }
         dar_gemm gh = back_h(&s, m, gp);
         dar_gemm_run(&gh, s.rest);
-        for (int of = 0; of < (s.r ? LORA_B : B); of++) {
+        for (int of = (s.r ? LORA_B : B) - 1; of >= X; of--) { /* gx last: it may lie over x */
             dar_gemm g = back(&s, of, i, m, gp);
             dar_gemm_run(&g, s.rest);
         }
@@ -468,6 +474,8 @@ const dar_op dar_op_linear = {
     .n_in = 3,
     .n_optional = 1,
     .keep = DAR_KEEP_X(X) | DAR_KEEP_X(W),
+    .over = true,
+    .half = DAR_KEEP_X(X) | DAR_KEEP_Y,
     .attr_size = sizeof(struct attr),
     .shape = linear_shape,
     .dtype = type_of,
@@ -488,6 +496,8 @@ const dar_op dar_op_lora = {
     .n_in = 5,
     .n_optional = 1,
     .keep = DAR_KEEP_X(X) | DAR_KEEP_X(W) | DAR_KEEP_X(A) | DAR_KEEP_X(U),
+    .over = true,
+    .half = DAR_KEEP_X(X) | DAR_KEEP_Y,
     .attr_size = sizeof(struct attr),
     .shape = lora_shape,
     .dtype = type_of,

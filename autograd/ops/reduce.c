@@ -195,13 +195,13 @@ static void error_row(const dar_kern *k, const void *arg, size_t n, const void *
     if (x[2]) k->mul(n, y, x[2], y);
 }
 
-/* arg w (x - y). */
+/* arg w (x - y), which may lie where x lies. */
 static void slope_row(const dar_kern *k, const void *arg, size_t n, const void *const *x, void *y)
 {
-    k->scale(n, -1, x[1], y);
-    k->add(n, x[0], y, y);
+    k->scale(n, -1, x[0], y);
+    k->add(n, x[1], y, y);
     if (x[2]) k->mul(n, y, x[2], y);
-    k->scale(n, *(const double *)arg, y, y);
+    k->scale(n, -*(const double *)arg, y, y);
 }
 
 static dar_bcast error_sum(const dar_opctx *c)
@@ -255,6 +255,7 @@ const dar_op dar_op_squared_error = {
     .name = "squared_error",
     .n_in = 3,
     .n_optional = 1,
+    .over = true,
     .keep = DAR_KEEP_X(0) | DAR_KEEP_X(1) | DAR_KEEP_X(2),
     .frozen = DAR_KEEP_X(2),
     .attr_size = sizeof(bool),

@@ -73,21 +73,25 @@ struct walk {
     bool backward;
 };
 
-/* In pieces of whole heads.  Both sides are stored alike; what is added to is a gradient, of the arithmetic type. */
+/* In pieces of whole heads.  What is added to is a gradient, of the arithmetic type; else only gradients differ in how
+ * they are stored. */
 static void rotate_rows(void *ctx, size_t begin, size_t end, int thread)
 {
     const struct walk *w = ctx;
     const dar_kern *k = dar_kern_for(w->type);
     size_t step = DAR_PIECE / w->e * w->e;
-    double tbuf[DAR_PIECE], sum[DAR_PIECE];
+    bool alike = w->from->dtype == w->to->dtype;
+    dar_dtype as = alike ? w->to->dtype : w->type;
+    double tbuf[DAR_PIECE], xbuf[DAR_PIECE], ybuf[DAR_PIECE];
     (void)thread;
     for (size_t row = begin; row < end; row++) {
         const void *angles = dar_tensor_at(w->table, row % w->tokens * w->e);
         const void *table = dar_row_get(w->type, w->table->dtype, angles, w->e, tbuf);
         for (size_t j = 0; j < w->d; j += step) {
             size_t n = w->d - j < step ? w->d - j : step, i = row * w->d + j;
-            void *to = dar_tensor_at(w->to, i), *y = w->mode == DAR_PUT_ADD ? sum : to;
-            k->rope[w->to->dtype](n, w->e, dar_tensor_at(w->from, i), table, y, w->backward, w->mode == DAR_PUT_STREAM);
+            const void *x = dar_row_get(as, w->from->dtype, dar_tensor_at(w->from, i), n, xbuf);
+            void *to = dar_tensor_at(w->to, i), *y = alike && w->mode != DAR_PUT_ADD ? to : ybuf;
+            k->rope[as](n, w->e, x, table, y, w->backward, y == to && w->mode == DAR_PUT_STREAM);
             if (y != to) dar_row_put(w->type, y, w->to->dtype, to, n, w->mode);
         }
     }
@@ -148,6 +152,7 @@ const dar_op dar_op_rope = {
     .n_in = 2,
     .in_place = true,
     .keep = DAR_KEEP_X(TABLE),
+    .half = DAR_KEEP_X(X) | DAR_KEEP_Y,
     .frozen = DAR_KEEP_X(TABLE),
     .shape = rope_shape,
     .forward = rope_forward,
