@@ -654,6 +654,17 @@ static void dropped_values(void **state)
     dar_val *v = dar_leaf(&tape, tx, &tg), *y = dar_silu(&tape, v);
     dar_drop(&tape, y);
     assert_non_null(y->x.data); /* not in a segment */
+    tape.recording = false;
+    dar_tape_place place = dar_tape_mark(&tape);
+    dar_val *z = dar_silu(&tape, v);
+    dar_drop(&tape, z);
+    assert_null(z->x.data);
+    size_t used = arena.used;
+    dar_silu(&tape, v); /* where z was */
+    assert_int_equal(arena.used, used);
+    dar_tape_reset(&tape, place);
+    assert_int_equal(tape.spare.count, 0);
+    tape.recording = true;
     y = dar_segment(&tape, drop, NULL, &v, 1, DAR_F64, DAR_SHAPE(4));
     dar_backward(&tape, y, &(dar_tensor){ .dtype = DAR_F64, .shape = tx.shape, .stride = { 1 }, .data = one });
     for (int i = 0; i < 4; i++) {
