@@ -112,16 +112,6 @@ static dar_val *gate(dar_tape *t, const struct block *a, dar_val *x, dar_val *u,
     return y;
 }
 
-/* q, k and v are not looked at again. */
-static dar_val *attention(dar_tape *t, dar_val *q, dar_val *k, dar_val *v, const dar_attention_opt *o)
-{
-    dar_val *y = dar_attention(t, q, k, v, o);
-    dar_drop(t, q);
-    dar_drop(t, k);
-    dar_drop(t, v);
-    return y;
-}
-
 /* x [B, L, D] -> [B, L, D], all three; with a->rest self-attention gives the tokens after the first frame's alone */
 static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
 {
@@ -139,7 +129,10 @@ static dar_val *self_attention(dar_tape *t, const struct block *a, dar_val *x)
     }
     dar_val *q = turned(t, rms(t, a, a->b->norm_q[0], product(t, a, DAR_SELF_Q, h)), rope);
     dar_drop(t, h);
-    h = attention(t, q, k, v, &o);
+    h = dar_attention(t, q, k, v, &o);
+    dar_drop(t, q);
+    dar_drop(t, k);
+    dar_drop(t, v);
     return gate(t, a, x, last_product(t, a, DAR_SELF_O, h, true), mod[GATE]);
 }
 
@@ -150,7 +143,8 @@ static dar_val *cross_attention(dar_tape *t, const struct block *a, dar_val *x)
     dar_val *h = dar_layer_norm(t, x, dar_param_leaf(t, a->b->norm3_w), dar_param_leaf(t, a->b->norm3_b), &norm);
     dar_val *q = rms(t, a, a->b->norm_q[1], product(t, a, DAR_CROSS_Q, h));
     dar_drop(t, h);
-    h = attention(t, q, a->k, a->v, &o);
+    h = dar_attention(t, q, a->k, a->v, &o);
+    dar_drop(t, q); /* keys and values belong to the text */
     h = last_product(t, a, DAR_CROSS_O, h, false);
     x = dar_add(t, x, h);
     dar_drop(t, h);
