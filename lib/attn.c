@@ -486,15 +486,17 @@ static void backward_block(const struct job *j, const struct backward_scratch *f
         product(out, n, j->E, m, ds_t, f->k_cols + block * bytes_b(out, j->E, ROWS_BACK), f->dq, j->E, k0 > 0);
 }
 
-/* gx[row + i, col ...] = (add ? that : 0) + scale x[i] for n rows of one head; x is overwritten if gx is bf16. */
+/* gx[row + i, col ...] = (add ? that : 0) + scale x[i] for n rows of one head.  bf16 is not added to, and x is
+ * overwritten then. */
 static void store(const struct job *j, const dar_tensor *gx, size_t row, size_t col, size_t n, double scale, char *x,
                   bool add)
 {
     bool half = gx->dtype != j->real;
+    DAR_ASSERT(!(half && add), "attention: a gradient in bf16 is added to");
     for (size_t i = 0; i < n; i++, x += j->E * j->real_size) {
         char *to = row_at(gx, row + i, col);
-        (add && !half ? j->rows->axpy : j->rows->scale)(j->E, scale, x, half ? x : to);
-        if (half) dar_row_put(j->real, x, gx->dtype, to, j->E, add ? DAR_PUT_ADD : DAR_PUT);
+        (add ? j->rows->axpy : j->rows->scale)(j->E, scale, x, half ? x : to);
+        if (half) dar_row_put(j->real, x, gx->dtype, to, j->E, DAR_PUT);
     }
 }
 

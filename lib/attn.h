@@ -21,7 +21,7 @@
 #include "lib/tensor.h"
 
 /* All contiguous.  q, k, v, y of any float types, f64 all or none; stats, gy and gradients f32, or f64 with them;
- * of gy, gk and gv each may be bf16. */
+ * of gy, gk and gv each may be bf16, and is not added to then. */
 typedef struct dar_attn {
     dar_tensor q, y; /* [B, Nq, D], D = heads E */
     dar_tensor k, v; /* [B, Nk, D] */
