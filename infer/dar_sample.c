@@ -21,7 +21,7 @@
 #define MOST 1000 /* bundles of one call */
 
 static struct {
-    const char *out, *model, *weights, *part[DAR_MODEL_PARTS], *channels, *noise, *text, *negative, *front;
+    const char *out, *model, *weights, *part[DAR_MODEL_PARTS], *channels, *noise, *text, *negative, *front, *reuse;
     int64_t steps;
     double guidance, shift, strength, tolerance, guidance_tolerance, error_budget;
     int solver, grid, precision, skip;
@@ -87,6 +87,9 @@ static const dar_option options[] = {
     { .name = "tolerance", .placeholder = "T", .type = DAR_ARG_NUMBER, .target = &o.tolerance, .standard = "0",
       .lo = 0, .hi = 1, .help = "leave out steps that earlier ones foretell: each may be off by T of the latent "
       "(models/solver.h); 0: none" },
+    { .name = "reuse", .placeholder = "RULE", .type = DAR_ARG_TEXT, .target = &o.reuse, .standard = "none",
+      .help = "table:N runs the network in every N-th step, change:X where its input has changed by X since it ran; "
+      "else what its blocks added is added again: published rules, to compare with (models/reuse.h)" },
     { .name = "error-budget", .placeholder = "E", .type = DAR_ARG_NUMBER, .target = &o.error_budget, .standard = "0",
       .lo = 0, .hi = 1, .help = "choose precision, solver, steps and tolerances: what was measured to be fastest for "
       "the kind of scene and is off by E of the full run's latent at most (infer/front.h); 0: as these options say" },
@@ -172,6 +175,14 @@ static dar_status read_window(dar_pipeline_options *p, dar_err *e)
                     (long long)o.overlap, (long long)(o.window - 5));
 }
 
+static dar_status read_reuse(dar_sampler_config *c, dar_err *e)
+{
+    dar_err why;
+    if (dar_reuse_read(&c->reuse, o.reuse, &why) != DAR_OK) return dar_fail(e, DAR_ERR_USAGE, "--reuse: %s", why.text);
+    if (!c->reuse.rule || !(o.tolerance > 0 || o.guidance_tolerance > 0 || o.error_budget > 0)) return DAR_OK;
+    return dar_fail(e, DAR_ERR_USAGE, "--reuse: found a tolerance or an error budget too, expected one of them");
+}
+
 static dar_status read_options(struct job *j, dar_err *e)
 {
     const char *name = j->r->program->name;
@@ -190,6 +201,7 @@ static dar_status read_options(struct job *j, dar_err *e)
     if (strcmp(o.noise, "torch") == 0) p->noise = DAR_NOISE_TORCH;
     else if (strcmp(o.noise, "own") != 0) p->noise_file = o.noise;
     DAR_TRY(read_window(p, e));
+    DAR_TRY(read_reuse(&p->sampler, e));
     return read_skips(&p->sampler.skip, e);
 }
 
@@ -419,6 +431,7 @@ static void print_sampler(dar_json_writer *w, const struct job *j)
     dar_json_write_number(w, "shift", c->solver.shift);
     dar_json_write_text(w, "solver", dar_solver_name[c->solver.kind]);
     if (c->solver.tolerance > 0) dar_json_write_number(w, "tolerance", c->solver.tolerance);
+    if (c->reuse.rule) dar_json_write_text(w, "reuse", o.reuse);
     if (c->solver.budget > 0) dar_json_write_number(w, "estimate_allowed", c->solver.budget);
     dar_json_write_text(w, "grid", dar_flow_grid_name[c->solver.grid]);
     dar_json_write_text(w, "noise", j->how.noise_file ? "file" : o.noise);
@@ -538,6 +551,7 @@ static void tell_video(struct job *j, const dar_pipeline *p, const struct hearin
     dar_json_write_int(&j->r->json, "steps", (int64_t)ran->steps);
     dar_json_write_int(&j->r->json, "steps_rejected", (int64_t)ran->rejected);
     dar_json_write_number(&j->r->json, "estimated_error", ran->estimate);
+    dar_json_write_int(&j->r->json, "steps_reused", (int64_t)ran->reused);
     dar_json_write_int(&j->r->json, "guidance_left_out", (int64_t)ran->left_out);
     dar_json_write_number(&j->r->json, "guidance_error", ran->worst);
     dar_json_write_object(&j->r->json, "seconds");

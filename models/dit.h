@@ -136,6 +136,10 @@ void dar_dit_blocks_begin(dar_tape *t, const dar_dit *m, const dar_dit_scene *s,
 dar_val *dar_dit_blocks_end(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,
                             const dar_dit_moment *e, dar_val *tokens);
 
+/* What the first block's products read, in the main type: tokens, normed and modulated. */
+dar_val *dar_dit_blocks_read(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e,
+                             dar_val *tokens);
+
 /* Of a scene that is held: tokens without those of the first frame, velocity without it. */
 dar_val *dar_dit_head(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e, dar_val *tokens);
 

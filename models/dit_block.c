@@ -299,6 +299,16 @@ void dar_dit_blocks_begin(dar_tape *t, const dar_dit *m, const dar_dit_scene *s,
     in_place(t, self_attention, &a, tokens, tokens);
 }
 
+dar_val *dar_dit_blocks_read(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_moment *e,
+                             dar_val *tokens)
+{
+    struct block a = { .m = m, .b = &m->block[0], .s = s, .e0 = e->e0 };
+    dar_norm_opt norm = { .eps = m->c.eps, .split = s->frame };
+    dar_val *mod[3];
+    modulations(t, &a, 0, mod);
+    return dar_modulate(t, tokens, mod[SCALE], mod[SHIFT], &norm);
+}
+
 dar_val *dar_dit_blocks_end(dar_tape *t, const dar_dit *m, const dar_dit_scene *s, const dar_dit_text *x,
                             const dar_dit_moment *e, dar_val *tokens)
 {

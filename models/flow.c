@@ -117,6 +117,19 @@ static double square_range(void *ctx, size_t begin, size_t end)
     return sum;
 }
 
+static double size_range(void *ctx, size_t begin, size_t end)
+{
+    const combination *c = ctx;
+    double buf[DAR_PIECE], wide[DAR_PIECE], sum = 0;
+    for (size_t i = begin; i < end; i += DAR_PIECE) {
+        size_t n = end - i < DAR_PIECE ? end - i : DAR_PIECE;
+        combine_piece(c, i, n, buf);
+        dar_row_convert(DAR_F64, wide, c->x[0]->dtype, buf, n);
+        for (size_t k = 0; k < n; k++) sum += fabs(wide[k]);
+    }
+    return sum;
+}
+
 static void check_terms(int n, const dar_tensor *const *x, const dar_tensor *y)
 {
     DAR_ASSERT(n >= 1 && n <= MOST, "flow: %d terms, expected 1 to %d", n, MOST);
@@ -140,6 +153,13 @@ double dar_flow_norm(int n, const double *a, const dar_tensor *const *x)
     check_terms(n, x, x[0]);
     combination c = { n, a, x, NULL };
     return sqrt(dar_parallel_sum(dar_tensor_count(x[0]), 16 * DAR_PIECE, square_range, &c));
+}
+
+double dar_flow_size(int n, const double *a, const dar_tensor *const *x)
+{
+    check_terms(n, x, x[0]);
+    combination c = { n, a, x, NULL };
+    return dar_parallel_sum(dar_tensor_count(x[0]), 16 * DAR_PIECE, size_range, &c);
 }
 
 void dar_flow_mix(const dar_tensor *z0, const dar_tensor *eps, double sigma, const dar_tensor *z)

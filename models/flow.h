@@ -58,6 +58,9 @@ void dar_flow_combine(int n, const double *a, const dar_tensor *const *x, const 
 /* The Euclidean norm of such a combination, the same bits for any number of threads. */
 double dar_flow_norm(int n, const double *a, const dar_tensor *const *x);
 
+/* The sum of its absolute values, likewise. */
+double dar_flow_size(int n, const double *a, const dar_tensor *const *x);
+
 /* ---------------------------------------------------------------- grids of sigmas for sampling */
 
 typedef enum dar_flow_grid {

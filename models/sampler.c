@@ -141,6 +141,8 @@ static void prepare_scene(dar_sampler *s, dar_tape *t, dar_dit_clip d, int64_t i
 dar_status dar_sampler_init(dar_sampler *s, const dar_dit *m, const dar_sampler_config *c, const dar_sampler_clip *clip,
                             dar_arena *kept, dar_arena *step, dar_err *e)
 {
+    DAR_ASSERT(!c->reuse.rule || (c->solver.tolerance <= 0 && c->guidance_tolerance <= 0),
+               "sampler: steps are held by a rule, and others left out by a tolerance");
     *s = (dar_sampler){ .m = m, .c = *c, .clip = *clip, .windows = dar_sampler_windows(clip) };
     dar_status status = dar_tape_init(&s->kept, kept, e);
     if (status == DAR_OK) status = dar_tape_init(&s->step, step, e);
@@ -179,14 +181,20 @@ double dar_sampler_flops(const dar_sampler *s)
 struct view {
     dar_dit_clip clip;
     dar_dit_scene scene;
+
+    /* To be used again (models/reuse.h). */
+    dar_tensor read;     /* [1, L, D] by the first block in the step before */
+    dar_tensor added[2]; /* [1, L', D] by the blocks, with both prompts, to the tokens that come out of them */
 };
 
 struct run {
     struct view *view; /* [windows] */
     double *times;     /* [frames of a window] as told to the network, in rows */
     int64_t rows;
-    bool hold;                  /* the first frame is known */
-    bool both;                  /* prompts are asked */
+    bool hold; /* the first frame is known */
+    bool both; /* prompts are asked */
+    bool asks; /* the blocks are run */
+    dar_reuse reuse;
     dar_tensor z, v[2];         /* of a window: latent, velocities with both prompts */
     dar_tensor whole[2], clean; /* of the clip: velocities, where the step saw it go */
 };
@@ -205,6 +213,16 @@ static void prepare_view(dar_sampler *s, struct view *w, int64_t i, const dar_te
     w->scene.held = hold && skips(s, DAR_SKIP_HELD);
 }
 
+static void prepare_reuse(dar_sampler *s, struct view *w)
+{
+    const int64_t p = s->m->c.patch, frame = s->clip.height / p * (s->clip.width / p), D = s->m->c.width;
+    const int64_t F = window_frames(&s->clip);
+    if (s->c.reuse.rule == DAR_REUSE_CHANGE)
+        w->read = dar_tensor_push(s->kept.arena, s->m->main, DAR_SHAPE(1, F * frame, D));
+    for (int i = 0; i <= s->twice && s->c.reuse.rule; i++)
+        w->added[i] = dar_tensor_push(s->kept.arena, s->m->main, DAR_SHAPE(1, (F - w->scene.held) * frame, D));
+}
+
 static void write_times(const dar_sampler *s, struct run *r, double time)
 {
     r->rows = skips(s, DAR_SKIP_TIMES) ? 1 + r->hold : window_frames(&s->clip);
@@ -214,6 +232,7 @@ static void write_times(const dar_sampler *s, struct run *r, double time)
 
 /* What comes before a prompt: on the tape of the step. */
 struct begun {
+    const struct view *view;
     dar_dit_scene scene;
     dar_dit_time time;
     dar_dit_moment e;
@@ -224,6 +243,7 @@ static void begin(dar_sampler *s, const struct run *r, int64_t i, struct begun *
 {
     const struct view *w = &r->view[i];
     dar_tape *t = &s->step;
+    b->view = w;
     b->scene = w->scene;
     if (!skips(s, DAR_SKIP_SCENE)) {
         prepare_scene(s, t, w->clip, i, &b->scene);
@@ -233,18 +253,41 @@ static void begin(dar_sampler *s, const struct run *r, int64_t i, struct begun *
     b->z = dar_leaf(t, r->z, NULL);
     b->e = dar_dit_time_embed(t, s->m, 1, &b->time);
     b->tokens = dar_dit_embed(t, s->m, &b->scene, b->z);
-    dar_dit_blocks_begin(t, s->m, &b->scene, &b->e, b->tokens);
+    if (r->asks) dar_dit_blocks_begin(t, s->m, &b->scene, &b->e, b->tokens);
+}
+
+/* Without those that do not come out of the blocks. */
+static dar_val *outgoing(dar_tape *t, const struct begun *b, dar_val *tokens)
+{
+    const int64_t first = b->scene.held ? b->scene.frame : 0;
+    return dar_slice(t, tokens, 1, first, tokens->x.shape.d[1] - first);
+}
+
+/* Tokens behind the blocks, run with a prompt; the tokens before them are embedded once more, to be subtracted. */
+static dar_val *run_blocks(dar_sampler *s, const struct begun *b, int prompt, dar_val *tokens)
+{
+    dar_tape *t = &s->step;
+    const dar_tensor *added = &b->view->added[prompt];
+    dar_dit_text text = s->text[prompt];
+    if (!skips(s, DAR_SKIP_TEXT)) dar_dit_text_prepare(t, s->m, &s->clip.text[prompt], NULL, &text);
+    dar_val *y = dar_dit_blocks_end(t, s->m, &b->scene, &text, &b->e, tokens);
+    s->calls++;
+    if (!s->c.reuse.rule) return y;
+    dar_val *r = dar_sub(t, y, outgoing(t, b, dar_dit_embed(t, s->m, &b->scene, b->z)));
+    if (!plans(s)) dar_tensor_copy(added, &r->x);
+    return y;
 }
 
 /* v: the velocity with a prompt; of a first frame that is held 0.  `keep`: what was begun is needed again. */
-static void finish(dar_sampler *s, const struct begun *b, int prompt, bool keep, const dar_tensor *v)
+static void finish(dar_sampler *s, const struct run *r, const struct begun *b, int prompt, bool keep,
+                   const dar_tensor *v)
 {
     dar_tape *t = &s->step;
     dar_tape_place place = dar_tape_mark(t);
-    dar_dit_text text = s->text[prompt];
-    if (!skips(s, DAR_SKIP_TEXT)) dar_dit_text_prepare(t, s->m, &s->clip.text[prompt], NULL, &text);
-    dar_val *x = keep ? dar_contiguous(t, b->tokens) : b->tokens;
-    dar_val *y = dar_dit_head(t, s->m, &b->scene, &b->e, dar_dit_blocks_end(t, s->m, &b->scene, &text, &b->e, x));
+    dar_val *x = b->tokens;
+    if (!r->asks) x = dar_add(t, outgoing(t, b, x), dar_leaf(t, b->view->added[prompt], NULL));
+    else x = run_blocks(s, b, prompt, keep ? dar_contiguous(t, x) : x);
+    dar_val *y = dar_dit_head(t, s->m, &b->scene, &b->e, x);
     y = dar_dit_velocity(t, s->m, &b->scene, y, b->z, &b->time);
     if (!plans(s)) {
         int64_t n = y->x.shape.d[2], held = v->shape.d[2] - n;
@@ -253,7 +296,6 @@ static void finish(dar_sampler *s, const struct begun *b, int prompt, bool keep,
         dar_tensor_copy(&to, &y->x);
     }
     dar_tape_reset(t, place);
-    s->calls++;
 }
 
 /* The velocities of window i. */
@@ -264,7 +306,7 @@ static void call(dar_sampler *s, const struct run *r, int64_t i)
     for (int prompt = 0; prompt <= r->both; prompt++) {
         bool share = r->both && skips(s, DAR_SKIP_BEGIN);
         if (prompt == 0 || !share) begin(s, r, i, &b);
-        finish(s, &b, prompt, share && prompt == 0, &r->v[prompt]);
+        finish(s, r, &b, prompt, share && prompt == 0, &r->v[prompt]);
         if (!share) dar_tape_reset(&s->step, place);
     }
     dar_tape_reset(&s->step, place);
@@ -281,6 +323,24 @@ static void call_all(dar_sampler *s, struct run *r, const dar_tensor *z)
         for (int p = 0; p <= r->both && !plans(s) && s->windows > 1; p++) scatter(s, i, &r->v[p], &r->whole[p]);
         dar_arena_reset(s->kept.arena, m);
     }
+}
+
+/* Whether the blocks are run in the step that is next; all windows decide as one. */
+static bool asks(dar_sampler *s, struct run *r, const dar_tensor *z)
+{
+    r->asks = false;
+    for (int64_t i = 0; i < s->windows && s->c.reuse.rule == DAR_REUSE_CHANGE; i++) {
+        dar_mark m = dar_arena_mark(s->kept.arena);
+        dar_tape_place place = dar_tape_mark(&s->step);
+        struct begun b;
+        r->z = gather(s, i, z, s->kept.arena);
+        begin(s, r, i, &b);
+        dar_val *read = dar_dit_blocks_read(&s->step, s->m, &b.scene, &b.e, b.tokens);
+        if (!plans(s)) dar_reuse_see(&r->reuse, &read->x, &r->view[i].read);
+        dar_tape_reset(&s->step, place);
+        dar_arena_reset(s->kept.arena, m);
+    }
+    return dar_reuse_asks(&r->reuse);
 }
 
 /* ---------------------------------------------------------------- a run */
@@ -316,16 +376,19 @@ static dar_status run_steps(dar_sampler *s, struct run *r, const dar_tensor *fir
     dar_guidance guidance;
     dar_solver_init(&solver, &s->c.solver, z, s->kept.arena);
     dar_guidance_init(&guidance, s->c.guidance, s->twice ? s->c.guidance_tolerance : 0, z, s->kept.arena);
+    dar_reuse_init(&r->reuse, &s->c.reuse, solver.steps);
     r->both = s->twice;
     if (first && !plans(s)) dar_dit_hold_first(z, first);
     for (size_t i = 0; i < solver.steps && plans(s); i++) {
         write_times(s, r, 0);
+        r->asks = asks(s, r, z);
         call_all(s, r, z);
     }
     while (solver.step < solver.steps && !plans(s)) {
         const double sigma = solver.sigma[solver.step], to_clean[] = { 1, -sigma };
         r->both = s->twice && dar_guidance_asks(&guidance, sigma);
         write_times(s, r, solver.time[solver.step]);
+        r->asks = asks(s, r, z);
         call_all(s, r, z);
         if (s->twice) dar_guidance_apply(&guidance, sigma, r->both ? u : NULL, v);
         DAR_TRY(check_finite(&solver, v, e));
@@ -339,6 +402,7 @@ static dar_status run_steps(dar_sampler *s, struct run *r, const dar_tensor *fir
     }
     s->steps = solver.calls, s->rejected = solver.rejected, s->estimate = solver.estimate;
     s->left_out = guidance.left_out, s->worst = guidance.worst;
+    s->reused = r->reuse.held;
     return DAR_OK;
 }
 
@@ -350,7 +414,10 @@ static void prepare_run(dar_sampler *s, struct run *r, const dar_tensor *known, 
     window.d[2] = window_frames(&s->clip);
     r->times = dar_arena_push(a, (size_t)s->clip.frames * sizeof *r->times);
     r->view = dar_tape_room(&s->kept, (size_t)s->windows * sizeof *r->view);
-    for (int64_t i = 0; i < s->windows; i++) prepare_view(s, &r->view[i], i, known, r->hold);
+    for (int64_t i = 0; i < s->windows; i++) {
+        prepare_view(s, &r->view[i], i, known, r->hold);
+        prepare_reuse(s, &r->view[i]);
+    }
     for (int p = 0; p <= s->twice; p++) {
         r->v[p] = dar_tensor_push(a, z->dtype, window);
         r->whole[p] = s->windows > 1 ? dar_tensor_push(a, z->dtype, z->shape) : r->v[p];

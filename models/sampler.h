@@ -21,6 +21,8 @@
  * the velocity goes over from one to the other in equal steps, at every step of the solver, so that there is one latent
  * and no seam to repair.  One window is the plain run.
  *
+ * Of steps that are not asked (models/reuse.h) the blocks are not run: an approximation, to compare others with.
+ *
  * One clip at a time; the same bits for any number of threads.  Source: the paper, section 4.3; Ho and Salimans 2022,
  * eq. 6 (guidance). */
 #ifndef DAR_MODELS_SAMPLER_H
@@ -28,6 +30,7 @@
 
 #include "models/dit.h"
 #include "models/guidance.h"
+#include "models/reuse.h"
 #include "models/solver.h"
 
 typedef enum dar_skip {
@@ -52,6 +55,7 @@ typedef struct dar_sampler_config {
     double guidance;           /* g; 1: none */
     double guidance_tolerance; /* G (models/guidance.h); 0: u is computed in every step */
     unsigned skip;             /* bits 1 << dar_skip */
+    dar_reuse_config reuse;    /* with a rule, both tolerances are 0 */
 } dar_sampler_config;
 
 /* The paper's: 50 steps of Euler, shift 5, guidance 3; every skip. */
@@ -83,6 +87,7 @@ typedef struct dar_sampler {
     double estimate;
     size_t left_out; /* steps without u; and the error of what stood for it, where that was compared */
     double worst;
+    size_t reused; /* steps in which the blocks were not run */
 
     /* Of the sampler itself. */
     dar_tape kept, step;

@@ -415,6 +415,10 @@ static void solvers_and_noise(void **state)
              solver[i]);
     assert_true(frames_differ("ab2", "unipc") && frames_differ("unipc", "dpm++"));
 
+    GOOD("seen", "-o", "reuse", "--model", "model", "--no-mp4", "--no-sheet", "--steps", "5", "--reuse", "table:2",
+         "--json");
+    CHECK(strstr(ran.out, "\"steps_reused\": 2"), "%s", ran.out);
+
     /* Noise of a file: the numbers that the program itself draws give the same video. */
     dar_arena a;
     dar_err e;
@@ -654,6 +658,8 @@ static void refusals(void **state)
     BAD(2, "world", "poor", "-o", "x", MODEL, "--reference", "a.png");
     BAD(2, "adapter.geometry 3", "clip", "-o", "x", MODEL, "--channels", "dar");
     BAD(2, "found 'pas'", "clip", "-o", "x", MODEL, "--no-skip", "pas");
+    BAD(2, "--reuse: found rule 'table:0'", "clip", "-o", "x", MODEL, "--reuse", "table:0");
+    BAD(2, "expected one of them", "clip", "-o", "x", MODEL, "--reuse", "table:2", "--tolerance", "0.1");
     BAD(2, "one name", "clip", "./clip/", "-o", "x", MODEL);
     BAD(2, "one name", "clip", "-o", "x", MODEL, "--reference", "a.png", "--reference", "frames/../a.png");
     assert_int_equal(

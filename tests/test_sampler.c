@@ -77,6 +77,7 @@ struct walk {
     dar_weights *steps; /* NULL: nobody compares */
     size_t seen, stop;  /* stop after so many; 0: never */
     bool jumps;         /* steps may be left out */
+    size_t reused;
     double worst;
 };
 
@@ -114,6 +115,7 @@ static dar_tensor sample(struct bench *b, struct walk *w, size_t *calls)
     assert_int_equal(b->kept.used, used);
     assert_int_equal(b->o.step.used, 0);
     if (calls) *calls = s.calls;
+    w->reused = s.reused;
     dar_sampler_free(&s);
     return z;
 }
@@ -452,6 +454,124 @@ static void guidance_tolerance(void **state)
     drop(&b);
 }
 
+static dar_tensor sample_reuse(struct bench *b, const char *rule, size_t *calls, size_t *reused)
+{
+    struct walk w = { 0 };
+    dar_err e;
+    CHECK(dar_reuse_read(&b->c.reuse, rule, &e) == DAR_OK, "%s", e.text);
+    dar_tensor z = sample(b, &w, calls);
+    *reused = w.reused;
+    return z;
+}
+
+/* Rules that hold nothing are the plain run; those that do hold what they say, with the same bits for any number of
+ * threads and with every skip left off. */
+static void reuse(void **state)
+{
+    (void)state;
+    static const char *const none[] = { "none", "table:1", "change:0" }, *const some[] = { "table:3", "change:0.6" };
+    const int threads = dar_threads();
+    size_t calls, reused;
+    for (int windows = 0; windows < 2; windows++) {
+        struct bench b;
+        init(&b, DAR_F32);
+        struct bench from = { .clip = b.clip, .known = b.known, .noise = b.noise };
+        const size_t each = windows ? 6 : 2; /* calls of a step */
+        b.c.solver.steps = 12;
+        if (windows) edit(&b, &from, line, 9), b.clip.window = 5, b.clip.overlap = 2;
+        dar_tensor plain = sample_reuse(&b, "none", &calls, &reused);
+        for (size_t i = 0; i < DAR_COUNT(none); i++) {
+            dar_tensor z = sample_reuse(&b, none[i], &calls, &reused);
+            same_bits(&z, &plain);
+            assert_int_equal(calls, 12 * each);
+            assert_int_equal(reused, 0);
+        }
+        for (size_t i = 0; i < DAR_COUNT(some); i++) {
+            dar_tensor z[3];
+            for (int n = 0; n < 3; n++) {
+                dar_threads_set(n + 1);
+                z[n] = sample_reuse(&b, some[i], &calls, &reused);
+                same_bits(&z[n], &z[0]);
+            }
+            dar_threads_set(threads);
+            double off = test_relative(&z[0], &plain);
+            printf("sampler: %s: %zu of 12 steps held, %.2g from the plain run\n", some[i], reused, off);
+            assert_int_equal(calls, (12 - reused) * each);
+            if (i == 0) assert_int_equal(reused, 7); /* 0, 3, 6, 9, 11 are asked */
+            CHECK(reused > 0 && off > 1e-4 && off < 0.5, "%s: %zu held, off by %g", some[i], reused, off);
+            b.c.skip = 0;
+            dar_tensor slow = sample_reuse(&b, some[i], &calls, &reused);
+            CHECK_NEAR("without skips", test_relative(&slow, &z[0]), 0, 1e-5);
+            b.c.skip = DAR_SKIPS_ALL;
+        }
+        drop(&b);
+    }
+}
+
+/* Blocks that add nothing: what is held is exact, if embedding, time and head see every step. */
+static void nothing_to_reuse(void **state)
+{
+    (void)state;
+    static const dar_projection last[] = { DAR_SELF_O, DAR_CROSS_O, DAR_FFN_DOWN };
+    struct bench b;
+    size_t calls, reused;
+    init(&b, DAR_F64);
+    for (int i = 0; i < b.o.c.dit.layers; i++)
+        for (size_t k = 0; k < DAR_COUNT(last); k++) {
+            dar_dit_product *p = &b.o.m.block[i].product[last[k]];
+            dar_tensor_fill(&p->w->x, 0);
+            dar_tensor_fill(&p->b->x, 0);
+            dar_tensor_fill(&p->up->x, 0);
+        }
+    dar_tensor plain = sample_reuse(&b, "none", &calls, &reused), z = sample_reuse(&b, "table:4", &calls, &reused);
+    assert_int_equal(reused, 3);
+    same_bits(&z, &plain);
+    drop(&b);
+}
+
+/* Three steps of Euler with two prompts, by hand: in the second the blocks are not run. */
+static void reuse_by_hand(void **state)
+{
+    (void)state;
+    struct bench b;
+    size_t calls, reused;
+    dar_tape t;
+    dar_solver solver;
+    dar_dit_scene scene;
+    dar_dit_text text[2];
+    dar_val *added[2] = { NULL }, *v[2];
+    dar_err e;
+    init(&b, DAR_F64);
+    b.c.solver.steps = 3, b.alone = true;
+    dar_tensor found = sample_reuse(&b, "table:9", &calls, &reused);
+    assert_int_equal(calls, 4);
+
+    const dar_dit *m = &b.o.m;
+    dar_dit_clip clip = { .clips = 1, .frames = 3, .height = 4, .width = 6, .cond = b.clip.cond };
+    assert_int_equal(dar_tape_init(&t, &b.kept, &e), DAR_OK);
+    t.recording = false;
+    dar_dit_scene_prepare(&t, m, &clip, &scene);
+    for (int p = 0; p < 2; p++) dar_dit_text_prepare(&t, m, &b.clip.text[p], NULL, &text[p]);
+    dar_solver_init(&solver, &b.c.solver, &b.noise, &b.kept);
+    for (int i = 0; i < 3; i++) {
+        dar_dit_time time = { &solver.time[i], 1 };
+        dar_val *z = dar_leaf(&t, b.noise, NULL), *x = dar_dit_embed(&t, m, &scene, z);
+        dar_dit_moment moment = dar_dit_time_embed(&t, m, 1, &time);
+        for (int p = 0; p < 2; p++) {
+            dar_val *y = i == 1 ? dar_add(&t, x, added[p])
+                                : dar_dit_blocks(&t, m, &scene, &text[p], &moment, dar_contiguous(&t, x));
+            if (i == 0) added[p] = dar_sub(&t, y, x);
+            v[p] = dar_dit_velocity(&t, m, &scene, dar_dit_head(&t, m, &scene, &moment, y), z, &time);
+        }
+        const double h = solver.sigma[i + 1] - solver.sigma[i], g = b.c.guidance;
+        dar_flow_combine(3, (double[]){ 1, h * g, h * (1 - g) }, (const dar_tensor *[]){ &b.noise, &v[0]->x, &v[1]->x },
+                         &b.noise);
+    }
+    CHECK_NEAR("latent", test_relative(&found, &b.noise), 0, 1e-13);
+    dar_tape_free(&t);
+    drop(&b);
+}
+
 /* One preparation, several runs: each as if alone.  A run that was stopped leaves nothing behind. */
 static void prepared_once(void **state)
 {
@@ -484,7 +604,7 @@ static void prepared_once(void **state)
 static void plan_is_what_is_taken(void **state)
 {
     (void)state;
-    for (int k = 0; k < 2 * DAR_SOLVERS; k++) {
+    for (int k = 0; k < 2 * DAR_SOLVERS + DAR_REUSE_RULES; k++) {
         struct bench b;
         struct walk w = { .jumps = true };
         dar_arena kept, step;
@@ -492,7 +612,9 @@ static void plan_is_what_is_taken(void **state)
         dar_err e;
         init(&b, DAR_F32);
         b.c.solver.kind = (dar_solver_kind)(k % DAR_SOLVERS);
-        b.c.solver.tolerance = b.c.guidance_tolerance = k < DAR_SOLVERS ? 0 : 0.1;
+        const bool reuses = k >= 2 * DAR_SOLVERS;
+        b.c.solver.tolerance = b.c.guidance_tolerance = k < DAR_SOLVERS || reuses ? 0 : 0.1;
+        if (reuses) b.c.reuse = (dar_reuse_config){ .rule = (dar_reuse_rule)(k - 2 * DAR_SOLVERS), .at = 2 };
         b.c.solver.grid = dar_solver_grid(b.c.solver.kind);
         b.kept.peak = b.o.step.peak = 0;
         sample(&b, &w, NULL);
@@ -503,7 +625,7 @@ static void plan_is_what_is_taken(void **state)
         assert_int_equal(dar_sampler_run(&s, &b.known, &b.first, &b.noise, NULL, NULL, &e), DAR_OK);
         assert_int_equal(kept.peak, b.kept.peak);
         assert_int_equal(step.peak, b.o.step.peak);
-        assert_int_equal(s.calls, 10);
+        assert_int_equal(s.calls, b.c.reuse.rule == DAR_REUSE_TABLE ? 6 : 10);
         CHECK(dar_sampler_flops(&s) > 0, "nothing is counted");
         dar_sampler_free(&s);
         dar_arena_free(&kept);
@@ -566,6 +688,9 @@ int main(void)
         cmocka_unit_test(any_threads),
         cmocka_unit_test(tolerance),
         cmocka_unit_test(guidance_tolerance),
+        cmocka_unit_test(reuse),
+        cmocka_unit_test(nothing_to_reuse),
+        cmocka_unit_test(reuse_by_hand),
         cmocka_unit_test(prepared_once),
         cmocka_unit_test(plan_is_what_is_taken),
         cmocka_unit_test(numbers_must_be_finite),
