@@ -56,6 +56,7 @@ enum { F64, F32, BF16, INT8, PRECISIONS };
 
 typedef struct setting {
     char name[WORK_TEXT], skips[WORK_TEXT];
+    const char *reuse;
     int precision, threads; /* threads 0: all */
     dar_sampler_config c;
 } setting;
@@ -95,7 +96,8 @@ static const struct group {
 static size_t add(setting *s, const struct group *g, size_t steps, double tolerance, double guidance)
 {
     size_t n = 0;
-    *s = (setting){ .precision = g->precision, .threads = g->threads, .c = dar_sampler_default(), .skips = "all" };
+    *s = (setting){ .precision = g->precision, .threads = g->threads, .skips = "all", .reuse = dar_reuse_name[0] };
+    s->c = dar_sampler_default();
     s->c.solver.kind = g->solver;
     s->c.solver.grid = dar_solver_grid(g->solver);
     s->c.solver.steps = steps;
@@ -142,11 +144,31 @@ static size_t add_skips(setting *s)
     return n;
 }
 
+/* The full run's steps, held by the rules that others publish. */
+static size_t add_caches(setting *s)
+{
+    static const char *const rules[] = { "table:2", "change:0.1",  "table:3",    "table:4",   "table:5",
+                                         "table:8", "change:0.05", "change:0.2", "change:0.4" };
+    size_t n = 0;
+    for (int p = F32; p <= BF16; p++)
+        for (size_t i = 0; i < DAR_COUNT(rules) && (!quick || (p == BF16 && i < 2)); i++) {
+            setting *x = &s[n++];
+            add(x, &(struct group){ .precision = p, .solver = DAR_EULER }, 50, 0, 0);
+            const size_t end = strlen(x->name);
+            snprintf(x->name + end, sizeof x->name - end, " %s", rules[i]);
+            DAR_ASSERT(dar_reuse_read(&x->c.reuse, rules[i], NULL) == DAR_OK, "no rule %s", rules[i]);
+            x->reuse = rules[i];
+        }
+    return n;
+}
+
 static size_t list_settings(setting *s)
 {
     size_t n = add_skips(s);
     for (size_t i = 0; i < DAR_COUNT(groups); i++)
         if (!quick || groups[i].quick) n += add_group(&s[n], &groups[i]);
+    n += add_caches(&s[n]);
+    DAR_ASSERT(n <= MOST, "%zu settings", n);
     return n;
 }
 
@@ -156,7 +178,7 @@ struct job {
     dar_run *r;
     dar_model_file file;
     dar_condition condition;
-    char model[WORK_TEXT]; /* as the rows have it */
+    char model[WORK_TEXT]; /* as the rows have it: weights, size and recipes of scenes */
     work_table table;
     work_scene *scene; /* [scenes] */
     size_t scenes;
@@ -280,6 +302,7 @@ static dar_status measure_row(struct job *j, const dar_model *m, const setting *
     snprintf(row.text[WORK_PRECISION], WORK_TEXT, "%s", dar_pipeline_precision[set->precision]);
     snprintf(row.text[WORK_SOLVER], WORK_TEXT, "%s", dar_solver_name[c->solver.kind]);
     memcpy(row.text[WORK_SKIPS], set->skips, WORK_TEXT);
+    snprintf(row.text[WORK_REUSE], WORK_TEXT, "%s", set->reuse);
     memcpy(row.text[WORK_MODEL], j->model, WORK_TEXT);
     row.v[WORK_STEPS] = (double)c->solver.steps;
     row.v[WORK_THREADS] = set->threads;
@@ -406,7 +429,8 @@ static dar_status hold(struct job *j, dar_err *e)
 
 static dar_status read_model(struct job *j, dar_err *e)
 {
-    char sum[DAR_SHA256_TEXT];
+    const work_size how = { (int)size[0], (int)size[1], (size_t)frames, common.seed };
+    char sum[DAR_SHA256_TEXT], recipes[WORK_KEY];
     dar_model *m;
     dar_condition_read(&j->condition, dar_json_object(dar_json_root(j->file.doc), "condition"));
     DAR_TRY(dar_json_finish(j->file.doc, e));
@@ -417,8 +441,10 @@ static dar_status read_model(struct job *j, dar_err *e)
     if (*m->path[DAR_MODEL_DIT]) s = dar_sha256_file(m->path[DAR_MODEL_DIT], sum, e);
     else s = dar_fail(e, DAR_ERR_USAGE, "%s: found no weights", model_path);
     dar_model_close(m);
-    snprintf(j->model, sizeof j->model, "%.20s %.8s %dx%dx%d", j->file.c.name, sum, (int)size[0], (int)size[1],
-             (int)frames);
+    if (s == DAR_OK) s = work_recipes(&how, recipes, e);
+    if (s == DAR_OK)
+        snprintf(j->model, sizeof j->model, "%.20s %.8s %dx%dx%d %s", j->file.c.name, sum, (int)size[0], (int)size[1],
+                 (int)frames, recipes);
     return s;
 }
 
@@ -459,6 +485,16 @@ static dar_status measure(struct job *j, dar_err *e)
     return measure_rows(j, set, n, e);
 }
 
+static void say_equal(const struct job *j)
+{
+    work_equal x[MOST];
+    const work_ratio r = work_equal_ratio(x, work_equals(&j->table, x, MOST));
+    dar_run_say(j->r, "%s/work_precision.html, .svg, .csv, .json; equal_calls.csv, pareto.json", out);
+    if (r.n)
+        dar_run_say(j->r, "with no more calls, our error is %.2g of that of %zu published caches, at worst %.2g",
+                    r.mean, r.n, r.worst);
+}
+
 static dar_status bench(dar_run *r, dar_err *e)
 {
     struct job j = { .r = r };
@@ -470,7 +506,7 @@ static dar_status bench(dar_run *r, dar_err *e)
     if (s == DAR_OK) s = work_open(&j.table, path, j.model, e);
     if (s == DAR_OK && !only_report) s = measure(&j, e);
     if (s == DAR_OK && !common.dry_run) s = work_report(&j.table, out, j.file.c.name, safety, front_path, e);
-    if (s == DAR_OK && !common.dry_run) dar_run_say(r, "%s/work_precision.html, .svg, .csv, .json; pareto.json", out);
+    if (s == DAR_OK && !common.dry_run) say_equal(&j);
     if (s == DAR_OK && !common.dry_run && held) s = hold(&j, e);
     for (size_t i = 0; j.scene && i < j.scenes; i++) work_scene_close(&j.scene[i]);
     work_close(&j.table);

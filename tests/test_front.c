@@ -3,12 +3,15 @@
 
 #include "tests/work.h"
 
-/* A setting on a scene; the full run takes 10 s. */
+/* A setting on a scene; the full run takes 10 s and 100 calls, the others as many calls in a second. */
 static void add(work_table *t, const char *scene, bool still, double visible, const char *setting, const char *solver,
                 double steps, double tolerance, double seconds, double error, double estimate)
 {
     work_row row = { 0 };
     dar_err e;
+    const char *rule = strstr(setting, "table:");
+    snprintf(row.text[WORK_REUSE], WORK_TEXT, "%s", rule ? rule : "none");
+    row.v[WORK_CALLS] = 10 * seconds;
     snprintf(row.text[WORK_SCENE], WORK_TEXT, "%s", scene);
     snprintf(row.text[WORK_SETTING], WORK_TEXT, "%s", setting);
     snprintf(row.text[WORK_PRECISION], WORK_TEXT, "%.4s", *setting == 'b' ? "bf16" : "f32");
@@ -35,6 +38,10 @@ static void add_scene(work_table *t, const char *scene, bool still, double visib
     add(t, scene, still, visible, "b slow", "ab2", 20, 1e-12, 3, 0.02, 0.02);   /* others are better */
     add(t, scene, still, visible, "b euler-10", "euler", 10, 0, 0.1, 0.005, 0); /* nothing would guard it */
     add(t, scene, still, visible, "b late", "ab2", 40, 1e-12, 7, 0.0001, 0.01); /* could take 1.1 with its guard */
+    add(t, scene, still, visible, "b table:2", "euler", 50, 0, 3, 0.1, 0);
+    add(t, scene, still, visible, "b table:4", "euler", 50, 0, 2.5, 0.02 * worse, 0);
+    add(t, scene, still, visible, "b table:20", "euler", 50, 0, 0.05, 0.00001, 0); /* nobody makes as few calls */
+    add(t, scene, still, visible, "f table:2", "euler", 50, 0, 5, 0.1, 0);         /* nor any in that precision */
     if (still) add(t, scene, still, visible, "b rare", "ab2", 9, 1e-12, 0.5, 0.05, 0.03);
 }
 
@@ -74,6 +81,12 @@ static void rows(void **state)
     assert_true(isnan(r->v[WORK_EDGE]));
     work_close(&again);
     refused(work_open(&again, path, "another", &e), &e, "found rows of some model");
+    work_close(&again);
+
+    /* A table with other columns is not taken for one with few rows. */
+    static const char other[] = "scene,setting,steps\na,full,50\n";
+    run_write(in_dir("other.csv"), other, sizeof other - 1);
+    refused(work_open(&again, in_dir("other.csv"), "some model", &e), &e, "found no column 'precision'");
     work_close(&again);
     work_close(&t);
 }
@@ -130,6 +143,52 @@ static void front(void **state)
     work_close(&t);
 }
 
+/* Beside each cache what makes no more calls: with a solver of several steps, or with a tolerance. */
+static void equal_calls(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *cache, *ours;
+        double calls[2], error[2];
+    } expected[] = {
+        { "b table:2", "b slow", { 0.3, 0.3 }, { 0.1, 0.02 } },
+        { "b table:4", "b T=0.1", { 0.25, 0.7 / 3 }, { 0.08, 0.04 } },
+        { "b table:20", NULL, { 0.005, NAN }, { 0.00001, NAN } },
+        { "f table:2", NULL, { 0.5, NAN }, { 0.1, NAN } },
+    };
+    work_table t;
+    work_equal x[8];
+    dar_err e;
+    char path[PATH_MAX], directory[PATH_MAX], text[512] = "";
+    snprintf(path, sizeof path, "%s", in_dir("equal.csv"));
+    snprintf(directory, sizeof directory, "%s", scratch_dir);
+    fill(&t, path);
+    assert_int_equal(work_equals(&t, x, DAR_COUNT(x)), DAR_COUNT(expected));
+    for (size_t i = 0; i < DAR_COUNT(expected); i++) {
+        const char *found = x[i].ours ? x[i].ours : "none", *right = expected[i].ours ? expected[i].ours : "none";
+        CHECK(strcmp(x[i].cache, expected[i].cache) == 0, "%s, expected %s", x[i].cache, expected[i].cache);
+        CHECK(strcmp(found, right) == 0, "%s: %s, expected %s", x[i].cache, found, right);
+        for (int k = 0; k < (x[i].ours ? 2 : 1); k++) {
+            CHECK_NEAR(x[i].cache, x[i].calls[k], expected[i].calls[k], 1e-12);
+            CHECK_NEAR(x[i].cache, x[i].error[k], expected[i].error[k], 1e-12);
+        }
+    }
+    const work_ratio r = work_equal_ratio(x, DAR_COUNT(expected)), none = work_equal_ratio(x + 2, 2);
+    assert_int_equal(r.n, 2);
+    CHECK_NEAR("mean", r.mean, sqrt(0.2 * 0.5), 1e-12);
+    CHECK_NEAR("worst", r.worst, 0.5, 1e-12);
+    assert_true(none.n == 0 && isnan(none.mean) && isnan(none.worst));
+
+    ok(work_report(&t, directory, "m", 1.5, NULL, &e), &e);
+    FILE *f = fopen(in_dir("equal_calls.csv"), "r");
+    assert_non_null(f);
+    assert_true(fread(text, 1, sizeof text - 1, f) > 0);
+    fclose(f);
+    CHECK(strstr(text, "\nb table:2,0.3,0.1,b slow,0.3,0.02,0.2\n"), "%s", text);
+    CHECK(strstr(text, "\nf table:2,0.5,0.1,,,,\n"), "%s", text);
+    work_close(&t);
+}
+
 /* By kind of scene: a share of visible pixels that was not measured is any. */
 static void choice(void **state)
 {
@@ -162,6 +221,7 @@ int main(void)
     static const struct CMUnitTest tests[] = {
         cmocka_unit_test(rows),
         cmocka_unit_test(front),
+        cmocka_unit_test(equal_calls),
         cmocka_unit_test(choice),
     };
     return cmocka_run_group_tests_name("front", tests, scratch_make, scratch_remove) != 0;

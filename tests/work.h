@@ -24,6 +24,7 @@ typedef enum work_column {
     WORK_SOLVER,
     WORK_STEPS,
     WORK_SKIPS,   /* "all", "none" or the only one */
+    WORK_REUSE,   /* rule of models/reuse.h: "none" but for the caches that others publish */
     WORK_THREADS, /* 0: all */
     WORK_SECONDS, /* median, of a video: encoding, sampling, decoding */
     WORK_FLOPS,
@@ -38,7 +39,7 @@ typedef enum work_column {
     WORK_GUIDANCE_TOLERANCE,
     WORK_SAMPLING, /* seconds of the solver alone */
     WORK_CALLS,    /* of the network */
-    WORK_BYTES,    /* of weights that these calls read, at least */
+    WORK_BYTES,    /* at least: of weights, read once a call; activations not counted */
     WORK_ESTIMATE, /* models/solver.h */
     WORK_ODE,      /* relative L2 of the latent against ode */
     WORK_TEMP_TRUTH,
@@ -67,14 +68,14 @@ typedef struct work_table {
     size_t n, room;
 } work_table;
 
-/* Read what is there; every row must be of this model.  The caller owes work_close. */
+/* Read what is there; it must have these columns, and every row be of this model.  The caller owes work_close. */
 dar_status work_open(work_table *t, const char *path, const char *model, dar_err *e);
 void work_close(work_table *t);
 
 const work_row *work_find(const work_table *t, const char *scene, const char *setting);
 dar_status work_add(work_table *t, const work_row *row, dar_err *e); /* to the file too, at once */
 
-void work_print(const work_table *t, dar_json_writer *w);
+void work_print(const work_table *t, dar_json_writer *w); /* an array "rows" */
 
 /* ---------------------------------------------------------------- scenes */
 
@@ -103,6 +104,10 @@ typedef struct work_scene {
 
 size_t work_scenes(void);
 
+/* What all scenes of this size are made by, in a few digits.  A scene's file has its own in its name. */
+#define WORK_KEY 9
+dar_status work_recipes(const work_size *size, char key[WORK_KEY], dar_err *e);
+
 /* Scene i below `directory`, made if it is not there. */
 dar_status work_scene_open(work_scene *s, size_t i, const char *directory, const work_size *size,
                            const dar_config *model, dar_err *e);
@@ -123,7 +128,26 @@ dar_status work_compare(const work_scene *s, const double *latent, const uint8_t
 /* The settings worth using; their names are the table's. */
 void work_front(const work_table *t, const char *model, double safety, dar_front *f);
 
-/* work_precision.json, .svg, .html and pareto.json in `directory`; the last also as `front`, unless that is NULL. */
+/* A published cache beside what this project does with as many calls of the network: of the settings on the same scenes
+ * in the same precision, whose solvers have several steps or leave some out, the one with the least error that makes no
+ * more calls. */
+typedef struct work_equal {
+    const char *cache, *ours;  /* settings; ours NULL: all make more calls */
+    double calls[2], error[2]; /* of both: share of the full run's, mean of the scenes; the largest of any scene */
+} work_equal;
+
+size_t work_equals(const work_table *t, work_equal *x, size_t most); /* returns how many, in the order of the rows */
+
+/* Our error over the caches': how many could be compared, geometric mean, the largest. */
+typedef struct work_ratio {
+    size_t n;
+    double mean, worst; /* NAN if n is 0 */
+} work_ratio;
+
+work_ratio work_equal_ratio(const work_equal *x, size_t n);
+
+/* equal_calls.csv; work_precision.json, .svg, .html and pareto.json in `directory`; the last also as `front`, unless
+ * that is NULL. */
 dar_status work_report(const work_table *t, const char *directory, const char *model, double safety, const char *front,
                        dar_err *e);
 

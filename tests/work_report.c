@@ -20,6 +20,7 @@ struct mean {
     double time, psnr_truth;     /* share of the full run's time, geometric mean; mean change [dB] */
     double error, ode, estimate; /* the largest */
     double psnr, ssim, flip;     /* the worst */
+    double calls;                /* share of the full run's, mean */
     double class[WORK_CLASSES];  /* the largest */
 };
 
@@ -55,6 +56,7 @@ static size_t collect(const work_table *t, int kind, struct mean *m)
         m[i].scenes++;
         m[i].time += log(r->v[WORK_SECONDS] / full->v[WORK_SECONDS]);
         m[i].psnr_truth += r->v[WORK_PSNR_TRUTH] - full->v[WORK_PSNR_TRUTH];
+        m[i].calls += r->v[WORK_CALLS] / full->v[WORK_CALLS];
         m[i].error = larger(m[i].error, r->v[WORK_ERROR]);
         m[i].ode = larger(m[i].ode, r->v[WORK_ODE]);
         m[i].estimate = larger(m[i].estimate, r->v[WORK_ESTIMATE]);
@@ -66,6 +68,7 @@ static size_t collect(const work_table *t, int kind, struct mean *m)
     for (i = 0; i < n; i++) {
         m[i].time = exp(m[i].time / (double)m[i].scenes);
         m[i].psnr_truth /= (double)m[i].scenes;
+        m[i].calls /= (double)m[i].scenes;
     }
     return n;
 }
@@ -77,6 +80,63 @@ static const struct mean *find(const struct mean *m, size_t n, const char *setti
     return NULL;
 }
 
+static bool is_cache(const work_row *r)
+{
+    return strcmp(r->text[WORK_REUSE], dar_reuse_name[DAR_REUSE_NONE]) != 0;
+}
+
+/* With all skips and threads. */
+static bool is_whole(const work_row *r)
+{
+    return strcmp(r->text[WORK_SKIPS], "all") == 0 && r->v[WORK_THREADS] == 0;
+}
+
+/* ---------------------------------------------------------------- published caches */
+
+static bool is_ours(const work_row *r)
+{
+    const bool euler = strcmp(r->text[WORK_SOLVER], dar_solver_name[DAR_EULER]) == 0;
+    return is_whole(r) && !is_cache(r) && (!euler || r->v[WORK_TOLERANCE] > 0);
+}
+
+static work_equal equal_of(const struct mean *m, size_t n, const struct mean *cache)
+{
+    const struct mean *best = NULL;
+    for (size_t i = 0; i < n; i++)
+        if (is_ours(m[i].row) && m[i].scenes == cache->scenes && m[i].calls <= cache->calls &&
+            strcmp(m[i].row->text[WORK_PRECISION], cache->row->text[WORK_PRECISION]) == 0 &&
+            m[i].error < (best ? best->error : INFINITY))
+            best = &m[i];
+    return (work_equal){ .cache = cache->row->text[WORK_SETTING],
+                         .ours = best ? best->row->text[WORK_SETTING] : NULL,
+                         .calls = { cache->calls, best ? best->calls : NAN },
+                         .error = { cache->error, best ? best->error : NAN } };
+}
+
+size_t work_equals(const work_table *t, work_equal *x, size_t most)
+{
+    struct mean m[MOST];
+    const size_t n = collect(t, DAR_FRONT_ANY, m);
+    size_t k = 0;
+    for (size_t i = 0; i < n && k < most; i++)
+        if (is_cache(m[i].row)) x[k++] = equal_of(m, n, &m[i]);
+    return k;
+}
+
+work_ratio work_equal_ratio(const work_equal *x, size_t n)
+{
+    work_ratio r = { .worst = NAN };
+    double sum = 0;
+    for (size_t i = 0; i < n; i++) {
+        const double ratio = x[i].error[1] / x[i].error[0];
+        if (!x[i].ours) continue;
+        r.worst = r.n++ ? larger(r.worst, ratio) : ratio;
+        sum += log(ratio);
+    }
+    r.mean = exp(sum / (double)r.n);
+    return r;
+}
+
 /* ---------------------------------------------------------------- the front */
 
 static int by_time(const void *a, const void *b)
@@ -85,14 +145,14 @@ static int by_time(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-/* What the sampler may choose: on all threads with all skips, and measured on every scene of the kind.  It makes the
- * full run's steps, all or those that its guard leaves; or its error is estimated, and if it is found out at the last
- * step, all of those steps after it take no longer than the full run. */
+/* What the sampler may choose: on all threads with all skips, not a cache, and measured on every scene of the kind.  It
+ * makes the full run's steps, all or those that its guard leaves; or its error is estimated, and if it is found out at
+ * the last step, all of those steps after it take no longer than the full run. */
 static bool eligible(const struct mean *m, size_t n, const struct mean *x, size_t scenes)
 {
     const work_row *r = x->row;
     char plain[2 * WORK_TEXT];
-    if (r->v[WORK_THREADS] > 0 || strcmp(r->text[WORK_SKIPS], "all") != 0) return false;
+    if (!is_whole(r) || is_cache(r)) return false;
     if (x->scenes != scenes || !isfinite(x->error)) return false;
     if (strcmp(r->text[WORK_SOLVER], dar_solver_name[DAR_EULER]) == 0) return r->v[WORK_STEPS] >= 50;
     snprintf(plain, sizeof plain, "%s euler-50", r->text[WORK_PRECISION]);
@@ -199,9 +259,13 @@ static void collect_lines(struct drawing *d, const struct mean *m, size_t n, coo
         char label[3 * WORK_TEXT];
         size_t k = 0;
         bool tolerance = r->v[WORK_TOLERANCE] > DAR_FRONT_WATCH, guided = r->v[WORK_GUIDANCE_TOLERANCE] > 0;
-        if (strcmp(r->text[WORK_SKIPS], "all") != 0 || r->v[WORK_THREADS] > 0 || !(m[i].error > ROUNDING)) continue;
-        snprintf(label, sizeof label, "%s %s, %s%s", r->text[WORK_PRECISION], r->text[WORK_SOLVER],
-                 tolerance ? "tolerance" : "steps", guided ? ", guidance" : "");
+        if (!is_whole(r) || !(m[i].error > ROUNDING)) continue;
+        if (is_cache(r))
+            snprintf(label, sizeof label, "%s cache by %.*s", r->text[WORK_PRECISION],
+                     (int)strcspn(r->text[WORK_REUSE], ":"), r->text[WORK_REUSE]);
+        else
+            snprintf(label, sizeof label, "%s %s, %s%s", r->text[WORK_PRECISION], r->text[WORK_SOLVER],
+                     tolerance ? "tolerance" : "steps", guided ? ", guidance" : "");
         while (k < d->lines && strcmp(d->line[k].label, label) != 0) k++;
         struct line *l = &d->line[k];
         if (k == d->lines) {
@@ -282,11 +346,44 @@ static void table_front(FILE *f, const dar_front *front)
     fputs("</table></div>\n", f);
 }
 
+static void table_equal(FILE *f, const work_equal *x, size_t n)
+{
+    const work_ratio r = work_equal_ratio(x, n);
+    if (!n) return;
+    fputs("<h2 id=caches>Beside published caches</h2><p class=note>A cache runs the network in every N-th of the full "
+          "run's steps (table), or when its input has changed by so much (change), and else adds what the blocks added "
+          "when they last ran. Ours is the setting of this project's with the least error that makes no more calls, in "
+          "the same precision on the same scenes. Calls as a mean share of the full run's, errors the largest.</p>",
+          f);
+    if (r.n)
+        fprintf(
+            f,
+            "<p>With no more calls of the network, our error is <b>%.3f</b> of the caches' in the geometric mean of "
+            "%zu settings, <b>%.3f</b> at worst.</p>",
+            r.mean, r.n, r.worst);
+    fputs("<div class=scroll><table><tr><th>cache<th>calls<th>error<th>ours<th>calls<th>error<th>ours over the cache's"
+          "</tr>\n",
+          f);
+    for (size_t i = 0; i < n; i++) {
+        fprintf(f, "<tr><td>%s", x[i].cache);
+        cell(f, "%.3f", x[i].calls[0]);
+        cell(f, "%.2e", x[i].error[0]);
+        fprintf(f, "<td>%s", x[i].ours ? x[i].ours : "&ndash;");
+        cell(f, "%.3f", x[i].calls[1]);
+        cell(f, "%.2e", x[i].error[1]);
+        cell(f, "%.3f", x[i].error[1] / x[i].error[0]);
+        fputs("</tr>\n", f);
+    }
+    fputs("</table></div>\n", f);
+}
+
 static void table_all(FILE *f, const struct mean *m, size_t n)
 {
     fputs("<h2 id=all>Every setting</h2><p class=note>Over all scenes: time as geometric mean, everything else the "
           "worst, but the change of PSNR against the bundle's own frames, a mean. Errors of the latent, relative L2 "
-          "against the full run, also by what its places show.</p><div class=scroll><table><tr><th>setting<th>scenes"
+          "against the full run, also by what its places show. In the CSV the column <code>bytes</code> is a lower "
+          "bound: weights, read once in a call of the network; activations come on top.</p><div "
+          "class=scroll><table><tr><th>setting<th>scenes"
           "<th>time<th>error<th>against the ODE<th>empty<th>still<th>moving<th>edge<th>PSNR<th>SSIM<th>FLIP"
           "<th>PSNR of truth</tr>\n",
           f);
@@ -386,6 +483,7 @@ static dar_status print_page(FILE *f, const work_table *t, const char *directory
                              struct drawing *d, dar_err *e)
 {
     struct mean m[MOST];
+    work_equal equal[MOST];
     const size_t n = collect(t, DAR_FRONT_ANY, m);
     qsort(m, n, sizeof *m, by_time);
     dar_html_begin(f, "Run time against error");
@@ -397,8 +495,8 @@ static dar_status print_page(FILE *f, const work_table *t, const char *directory
             t->n, front->kind[DAR_FRONT_ANY].scenes);
     DAR_TRY(
         figure(f, d, m, n, error_of, &by_error,
-               "Vertical: how far precisions are from each other, and the full run from what it approximates. To use a "
-               "velocity again for some steps, by a fixed table, is to take fewer steps of Euler.",
+               "Vertical: how far precisions are from each other, and the full run from what it approximates. Caches "
+               "are published rules, for comparison; to hold a velocity by a table is to take fewer steps of Euler.",
                e));
     fputs("<div class=plots>\n", f);
     DAR_TRY(figure(f, d, m, n, ode_of, &by_ode, "The same against f64 with many steps, which the full run is not.", e));
@@ -406,6 +504,7 @@ static dar_status print_page(FILE *f, const work_table *t, const char *directory
     DAR_TRY(figure(f, d, m, n, change_of, &by_change, "What it costs against the truth; 0 is nothing.", e));
     fputs("</div>\n", f);
     table_front(f, front);
+    table_equal(f, equal, work_equals(t, equal, MOST));
     DAR_TRY(pictures(f, t, directory, front, e));
     table_scenes(f, t);
     table_all(f, m, n);
@@ -454,11 +553,59 @@ static dar_status write_svg(const work_table *t, const char *directory, struct d
     return s;
 }
 
+static void print_equal(const work_table *t, dar_json_writer *w)
+{
+    work_equal x[MOST];
+    const size_t n = work_equals(t, x, MOST);
+    const work_ratio r = work_equal_ratio(x, n);
+    dar_json_write_object(w, "equal_calls");
+    dar_json_write_int(w, "compared", (int64_t)r.n);
+    dar_json_write_number(w, "ratio_mean", r.mean);
+    dar_json_write_number(w, "ratio_worst", r.worst);
+    dar_json_write_array(w, "caches");
+    for (size_t i = 0; i < n; i++) {
+        dar_json_write_object(w, NULL);
+        dar_json_write_text(w, "cache", x[i].cache);
+        dar_json_write_number(w, "calls", x[i].calls[0]);
+        dar_json_write_number(w, "error", x[i].error[0]);
+        if (x[i].ours) dar_json_write_text(w, "ours", x[i].ours);
+        dar_json_write_number(w, "ours_calls", x[i].calls[1]);
+        dar_json_write_number(w, "ours_error", x[i].error[1]);
+        dar_json_write_end(w);
+    }
+    dar_json_write_end(w);
+    dar_json_write_end(w);
+}
+
+static dar_status write_equal(const work_table *t, const char *directory, dar_err *e)
+{
+    work_equal x[MOST];
+    const size_t n = work_equals(t, x, MOST);
+    char *text = NULL;
+    size_t size = 0;
+    FILE *f = open_memstream(&text, &size);
+    if (!f) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", directory);
+    fputs("cache,calls,error,ours,ours_calls,ours_error,ratio", f);
+    for (size_t i = 0; i < n; i++) {
+        fprintf(f, "\n%s,%.6g,%.6g", x[i].cache, x[i].calls[0], x[i].error[0]);
+        if (x[i].ours)
+            fprintf(f, ",%s,%.6g,%.6g,%.6g", x[i].ours, x[i].calls[1], x[i].error[1], x[i].error[1] / x[i].error[0]);
+        else fputs(",,,,", f);
+    }
+    dar_status s = fclose(f) == 0 ? write_text(directory, "equal_calls.csv", text, e)
+                                  : dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", directory);
+    free(text);
+    return s;
+}
+
 static dar_status write_json(const work_table *t, const char *directory, const dar_front *f, const char *front,
                              dar_err *e)
 {
     dar_json_writer rows = { .pretty = true }, w = { .pretty = true };
+    dar_json_write_object(&rows, NULL);
     work_print(t, &rows);
+    print_equal(t, &rows);
+    dar_json_write_end(&rows);
     dar_front_print(f, &w);
     dar_status s = rows.failed || w.failed ? dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", directory) : DAR_OK;
     if (s == DAR_OK) s = write_text(directory, "work_precision.json", rows.text, e);
@@ -477,6 +624,7 @@ dar_status work_report(const work_table *t, const char *directory, const char *m
     if (!d) return dar_fail(e, DAR_ERR_NOMEM, "%s: out of memory", directory);
     work_front(t, model, safety, &f);
     dar_status s = write_json(t, directory, &f, front, e);
+    if (s == DAR_OK) s = write_equal(t, directory, e);
     if (s == DAR_OK) s = write_svg(t, directory, d, e);
     if (s == DAR_OK) s = write_page(t, directory, &f, d, e);
     free(d);

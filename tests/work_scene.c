@@ -10,6 +10,7 @@
 #include "lib/dir.h"
 #include "lib/rng.h"
 #include "lib/safetensors_write.h"
+#include "lib/sha256.h"
 #include "tests/work.h"
 
 #define TRIES 20   /* scenes until a camera path is safe */
@@ -52,7 +53,7 @@ static const struct recipe {
     { "dolly",   "the camera comes nearer", "dolly-15", .family = NULL },
     { "above", "seen from above, the frame is fuller", .own = &overhead },
     { "empty",   "nearly nothing is seen", .own = &far, .alone = true },
-    { "short",   "5 frames", "orbit-30", .frames = 5 },
+    { "frames-5", "the fewest: a single one is the reference itself", "orbit-30", .frames = 5 },
     { "long",    "twice as long, through windows", "half-orbit", .longer = 2 },
     { "prompts", "guided by two prompts that are drawn", "orbit-0-45", .prompts = true },
     { "other",   "things of other kinds, another camera", "ue-oblique-orbit", .set = DAR_ASSET_OOD },
@@ -78,21 +79,59 @@ static size_t frames_of(const struct recipe *r, const work_size *size)
     return r->frames ? r->frames : r->longer ? r->longer * (size->frames - 1) + 1 : size->frames;
 }
 
-static dar_status film(const struct recipe *r, const char *path, const work_size *size, dar_err *e)
+static dar_status plan_of(const struct recipe *r, const work_size *size, dar_synth_plan *plan, dar_err *e)
+{
+    *plan = dar_synth_standard();
+    plan->subject = kind_of(r->family);
+    plan->path = r->own;
+    plan->set = r->set;
+    plan->alone = r->alone;
+    plan->width = size->width, plan->height = size->height;
+    plan->frames = frames_of(r, size);
+    return r->path ? dar_trajectory_find(r->path, &plan->path, e) : DAR_OK;
+}
+
+/* Everything that a scene is made by, but the code. */
+static void hash(dar_sha256 *h, const struct recipe *r, const dar_synth_plan *p, uint64_t seed)
+{
+    char text[512];
+    snprintf(text, sizeof text, "%s %s %s %d %d %d %d %g %d %d %zu %g %d %llu", r->name,
+             p->subject ? p->subject->name : "", p->path ? p->path->name : "", (int)p->set, p->alone, p->coarse,
+             p->bare, p->reach, p->width, p->height, p->frames, p->fps, r->prompts, (unsigned long long)seed);
+    dar_sha256_add(h, text, strlen(text));
+    if (!p->path) return;
+    dar_sha256_add(h, &p->path->mirror, sizeof p->path->mirror);
+    dar_sha256_add(h, p->path->bound, sizeof p->path->bound);
+}
+
+static void finish_key(dar_sha256 *h, char key[WORK_KEY])
+{
+    char sum[DAR_SHA256_TEXT];
+    dar_sha256_finish(h, sum);
+    snprintf(key, WORK_KEY, "%.*s", WORK_KEY - 1, sum);
+}
+
+dar_status work_recipes(const work_size *size, char key[WORK_KEY], dar_err *e)
+{
+    dar_synth_plan plan;
+    dar_sha256 h;
+    dar_status s = DAR_OK;
+    dar_sha256_init(&h);
+    for (size_t i = 0; i < DAR_COUNT(recipes) && s == DAR_OK; i++) {
+        s = plan_of(&recipes[i], size, &plan, e);
+        if (s == DAR_OK) hash(&h, &recipes[i], &plan, size->seed);
+    }
+    finish_key(&h, key);
+    return s;
+}
+
+static dar_status film(const struct recipe *r, dar_synth_plan plan, const char *path, uint64_t seed, dar_err *e)
 {
     dar_synth s;
     dar_render_report report;
-    dar_synth_plan plan = dar_synth_standard();
-    plan.subject = kind_of(r->family);
-    plan.path = r->own;
-    plan.set = r->set;
-    plan.alone = r->alone;
-    plan.width = size->width, plan.height = size->height;
-    plan.frames = frames_of(r, size);
-    if (r->path) DAR_TRY(dar_trajectory_find(r->path, &plan.path, e));
     dar_status status = DAR_ERR_CHECK;
     for (uint64_t i = 0; i < TRIES && status == DAR_ERR_CHECK; i++) {
-        plan.seed = plan.look = plan.view = dar_rng_u64(size->seed, dar_rng_stream(r->name), i) >> 12;
+        plan.seed = plan.look = plan.view = dar_rng_u64(seed, dar_rng_stream(r->name), i) >> 12;
         status = dar_synth_make(&s, &plan, e);
         if (status == DAR_OK) status = dar_synth_film(&s, &plan, "bench", path, &report, e);
         dar_synth_free(&s);
@@ -201,11 +240,17 @@ static dar_status open_scene(work_scene *s, const struct recipe *r, const char *
 {
     static const char prompts[] = ".text.safetensors";
     struct stat st;
-    char file[PATH_MAX];
-    if (snprintf(s->path, PATH_MAX, "%s/%s-%dx%dx%zu-%llu", directory, r->name, size->width, size->height,
-                 frames_of(r, size), (unsigned long long)size->seed) >= PATH_MAX - (int)sizeof prompts)
+    char file[PATH_MAX], key[WORK_KEY];
+    dar_synth_plan plan;
+    dar_sha256 h;
+    DAR_TRY(plan_of(r, size, &plan, e));
+    dar_sha256_init(&h);
+    hash(&h, r, &plan, size->seed);
+    finish_key(&h, key);
+    if (snprintf(s->path, PATH_MAX, "%s/%s-%dx%dx%zu-%s", directory, r->name, size->width, size->height, plan.frames,
+                 key) >= PATH_MAX - (int)sizeof prompts)
         return dar_fail(e, DAR_ERR_USAGE, "%s: the path is too long", directory);
-    if (stat(s->path, &st) != 0) DAR_TRY(film(r, s->path, size, e));
+    if (stat(s->path, &st) != 0) DAR_TRY(film(r, plan, s->path, size->seed, e));
     if (r->prompts) {
         snprintf(file, sizeof file, "%.*s%s", PATH_MAX - (int)sizeof prompts, s->path, prompts);
         if (stat(file, &st) != 0) DAR_TRY(draw_prompts(file, model->dit.text_width, e));

@@ -17,6 +17,7 @@ static const struct {
     [WORK_SOLVER] = { "solver", true },
     [WORK_STEPS] = { "steps", false },
     [WORK_SKIPS] = { "skips", true },
+    [WORK_REUSE] = { "reuse", true },
     [WORK_THREADS] = { "threads", false },
     [WORK_SECONDS] = { "median_s", false },
     [WORK_FLOPS] = { "flops", false },
@@ -75,7 +76,15 @@ static bool read_line(work_row *row, char *line)
 
 static dar_status read_lines(work_table *t, char *text, const char *model, dar_err *e)
 {
-    strsep(&text, "\n");
+    const char *head = strsep(&text, "\n");
+    for (int k = 0; k < WORK_COLUMNS; k++) {
+        const size_t n = strlen(column[k].name);
+        if (strncmp(head, column[k].name, n) != 0 || head[n] != (k + 1 < WORK_COLUMNS ? ',' : '\0'))
+            return dar_fail(e, DAR_ERR_USAGE,
+                            "%s: found no column '%s' where it is expected: remove it, or give another --out", t->path,
+                            column[k].name);
+        head += n + 1;
+    }
     for (char *line; (line = strsep(&text, "\n"));) {
         work_row row = { 0 };
         if (!*line || !read_line(&row, line)) continue;
@@ -151,7 +160,7 @@ dar_status work_add(work_table *t, const work_row *row, dar_err *e)
 
 void work_print(const work_table *t, dar_json_writer *w)
 {
-    dar_json_write_array(w, NULL);
+    dar_json_write_array(w, "rows");
     for (size_t i = 0; i < t->n; i++) {
         dar_json_write_object(w, NULL);
         for (int k = 0; k < WORK_COLUMNS; k++) {
